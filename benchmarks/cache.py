@@ -1,13 +1,13 @@
 """Measure random reads of the feature cache.
 
-Rows of 2,048 float16 values, in random order, as training takes them.
+Rows of 2,048 float16 values, in random order, as training reads them.
 
     python benchmarks/cache.py --json
 
 An entry is written by `surgicai_vision.features.cache.encode` itself, with an encoder that costs
-nothing. Each repetition reads batches of 256 rows drawn at random from all of them: as they lie
+nothing. Each repetition reads batches of 256 rows drawn at random from all of them: as stored
 (`float16`), and cast to float32 as `training` does. The pages are in memory, as they are from the
-second epoch on. Every batch is checked to hold the rows asked for. Prints one JSON line.
+second epoch on. Every batch is checked to hold the requested rows. Prints one JSON line.
 """
 
 import argparse
@@ -25,7 +25,7 @@ DIM = 2048
 
 
 class Source:
-    """A dataset of tiny frames, each another."""
+    """A dataset of tiny frames, each different."""
 
     views = ("back",)
     policy_views = views
@@ -35,12 +35,12 @@ class Source:
         self.length = length
 
     def frames(self, view: str, start: int, stop: int) -> np.ndarray:
-        """Return frames start..stop; the first value says which."""
+        """Return frames start..stop; their values are the frame's number."""
         return np.broadcast_to(np.arange(start, stop)[:, None, None, None], (stop - start, 1, 1, 3))
 
 
 class Filler:
-    """An encoder whose row says which frame it is of."""
+    """An encoder whose rows hold the frame's number."""
 
     card = encoders.encoder_card("random")
     pool = "global"
@@ -57,7 +57,7 @@ class Filler:
 def read(
     rows: np.ndarray, count: int, batch: int, kind: type, generator: np.random.Generator
 ) -> float:
-    """Read `count` rows at random; return rows/s."""
+    """Read `count` random rows; return rows/s."""
     order = generator.integers(0, len(rows), (count // batch, batch))
     began = time.perf_counter()
     total = 0.0
@@ -73,7 +73,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--rows", type=int, default=50_000, help="rows of the entry: 4 KiB each")
+    parser.add_argument("--rows", type=int, default=50_000, help="rows of the entry, 4 KiB each")
     parser.add_argument("--read", type=int, default=200_000, help="rows read in each repetition")
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--repeats", type=int, default=5)

@@ -1,13 +1,13 @@
 """Render on a Ray cluster of two nodes while its workers are killed and a node is lost.
 
-Compare with a quiet run.
+Compare with an undisturbed run.
 
     python benchmarks/cluster.py --kills 10 --losses 1 --json
 
 Both nodes run on this machine's loopback and share its disk. The kills are spread over the
-episodes; a lost node comes back. Prints one JSON object last: whether the dataset is identical
-(digest and file fingerprint) and how many of its episodes stand in it twice. Exits with 1 unless it
-is and none does.
+episodes; a lost node is replaced. Prints one JSON object last: whether the dataset is identical
+(digest and file fingerprint) and how many episodes it has twice. Exits with 1 unless it is
+identical, has no episode twice, and all kills and losses happened.
 """
 
 import argparse
@@ -38,13 +38,13 @@ class TwoNodes:
         self._node = cluster.add_node(**_node())
 
     def lose_node(self) -> bool:
-        """Kill the second node with all its processes and put a new one in its place."""
+        """Kill the second node with all its processes and replace it."""
         self._cluster.remove_node(self._node, allow_graceful=False)
         self._node = self._cluster.add_node(**_node())
         return True
 
     def kill_worker(self, moments: random.Random) -> bool:
-        """Kill one worker that has a task; say whether there was one."""
+        """Kill one worker that has a task; return whether there was one."""
         return kill_one(busy_workers(), moments)
 
 
@@ -66,9 +66,9 @@ def two_nodes() -> Iterator[TwoNodes]:
 
 
 def busy_workers() -> list[int]:
-    """Return the processes in which Ray runs a task of the executor now.
+    """Return the processes in which Ray is running a task of the executor.
 
-    Ray gives them its name.
+    Ray names them after the task.
     """
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
@@ -94,7 +94,7 @@ def children(parent: int, name: bytes = b"spawn_main") -> list[int]:
 
 
 def kill_one(workers: list[int], moments: random.Random) -> bool:
-    """Kill one of some processes; say whether there was one."""
+    """Kill one of some processes; return whether there was one."""
     if not workers:
         return False
     try:
@@ -113,7 +113,7 @@ def spread(
 
 
 def main() -> int:
-    """Run the quiet and the disturbed rendering; exit 1 unless the datasets are identical."""
+    """Run the undisturbed and the disturbed rendering; exit 1 unless the datasets are identical."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

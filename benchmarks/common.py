@@ -1,6 +1,6 @@
-"""What the benchmarks share.
+"""Helpers that the benchmarks share.
 
-Workers, medians, and one JSON line that says where and with what it was measured.
+Workers, medians, and one JSON line that names the machine and the versions of a measurement.
 """
 
 import json
@@ -22,12 +22,12 @@ Result = TypeVar("Result")
 
 
 def emit(name: str, row: dict[str, Any], *, render: bool = False) -> None:
-    """Print one JSON line: the benchmark's name, its numbers, machine and versions."""
+    """Print one JSON line: the benchmark's name, its numbers, the machine and versions."""
     print(json.dumps({"benchmark": name, **row, "made_with": provenance(render=render)}))
 
 
 def spread(function: Callable[[Job], Result], jobs: Iterable[Job], workers: int) -> list[Result]:
-    """Return the results of `function` over `jobs`, in order; 0 workers run in this process."""
+    """Return the results of `function` over `jobs`, in order; with 0 workers, in this process."""
     if workers < 1:
         return [function(job) for job in jobs]
     with ProcessPoolExecutor(
@@ -42,17 +42,17 @@ def spread_resumable(
     workers: int,
     out: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """Return the results of `function` over `jobs`, in order, and say how far it is on stderr.
+    """Return the results of `function` over `jobs`, in order, and report progress on stderr.
 
     Args:
-        function: of one job; returns what JSON can hold.
-        jobs: what to do, each with a `repr` of its own.
-        workers: processes; 0 work in this one.
-        out: keep each result there as a line; a later call with the same jobs goes on from it.
+        function: takes one job; returns what JSON can hold.
+        jobs: what to do, each with a unique `repr`.
+        workers: processes; 0 runs the jobs in this one.
+        out: file for each result as a line; a later call with the same jobs continues from it.
     """
     done: dict[str, dict[str, Any]] = {}
     if out is not None and out.exists():
-        # A line that was cut off by an interruption is not counted.
+        # A line that was cut off by an interruption is ignored.
         whole = out.read_text().split("\n")[:-1]
         done = {row["job"]: row["result"] for row in map(json.loads, whole)}
         out.write_text("".join(line + "\n" for line in whole))
@@ -78,7 +78,7 @@ def spread_resumable(
 
 
 def _settle_in() -> None:
-    """Work in a folder of its own, where MuJoCo may write its log of warnings."""
+    """Change to a new folder, where MuJoCo may write its log of warnings."""
     os.chdir(tempfile.mkdtemp(prefix="benchmark-"))
 
 

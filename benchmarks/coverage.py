@@ -1,18 +1,19 @@
-"""Measure how often each nominal 95 % interval holds the true value, by simulation.
+"""Measure by simulation how often each nominal 95 % interval contains the true value.
 
     python benchmarks/coverage.py
     python benchmarks/coverage.py --repeats 500
 
-* clopper_pearson: exact, not sampled: the chance over all k of n, at rates from 0.01 to 0.99.
-* bootstrap: 3, 5 and 10 training seeds of 20 episodes. Each seed has its own success rate, drawn
-  from the Beta distribution of mean p and correlation r of two episodes of one seed (r = 0.2: the
-  seeds' rates scatter by 0.22 at p = 0.5, by 0.1 at 0.95), and its episodes are Bernoulli draws.
+* clopper_pearson: exact, not sampled: the probability over all k of n, at rates from 0.01 to 0.99.
+* bootstrap: 3, 5 and 10 training seeds with 20 episodes each. Each seed has its own success rate,
+  drawn from the Beta distribution with mean p and correlation r of two episodes of one seed
+  (r = 0.2: the seeds' rates scatter by 0.22 at p = 0.5, by 0.1 at 0.95). Its episodes are Bernoulli
+  draws.
 * lengths: the same for trajectory lengths: normal seeds, log-normal episodes.
-* area: 20 starts, five strengths: each start fails from a strength on that is its own.
+* area: 20 starts, five strengths; each start fails from its own strength onwards.
 
-Beside `bootstrap` stands `percentile`, the plain hierarchical bootstrap of 5 seeds, to show what it
-would have covered. `worst` is the smallest coverage of a table, `held` whether none is below 95 %
-by more than three standard errors of the simulation.
+For comparison with `bootstrap`, `percentile` is the plain hierarchical bootstrap of 5 seeds and
+shows what it would have covered. `worst` is the smallest coverage of a table; `held` says whether
+none is below 95 % by more than three standard errors of the simulation.
 """
 
 import argparse
@@ -37,8 +38,8 @@ CORRELATIONS = (0.0, 0.05, 0.1, 0.2)
 SIZES = ((3, 20), (5, 20), (10, 20))
 PAPER = (5, 20)
 LENGTHS = 5
-"""Times as many repeats for lengths: few rows, and an interval that covers little more than it
-must.
+"""Factor by which lengths have more repeats: they have few rows, and an interval that covers only
+slightly more than it must.
 """
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
@@ -46,7 +47,7 @@ Interval = tuple[float, float]
 
 
 def exact_coverage(trials: int, rate: float) -> float:
-    """Return the chance that Clopper and Pearson's interval holds the rate."""
+    """Return the probability that the Clopper-Pearson interval contains the rate."""
     bounds = [clopper_pearson(k, trials) for k in range(trials + 1)]
     chances = binom.pmf(np.arange(trials + 1), trials, rate)
     return float(
@@ -72,7 +73,7 @@ def percentile(groups: np.ndarray, rng: np.random.Generator, resamples: int) -> 
 
 
 def count(draws: Iterator[tuple[float, Interval]]) -> tuple[float, float]:
-    """Return how often the interval held the truth, and its mean width."""
+    """Return how often the interval contained the true value, and its mean width."""
     held = 0
     width = 0.0
     total = 0
@@ -112,7 +113,7 @@ def lengths(
 def areas(starts: int, spread: float, repeats: int) -> Iterator[tuple[float, Interval]]:
     """Draw curves of successes and the intervals of their areas.
 
-    A start fails from Beta(spread, spread) on.
+    Each start fails from a strength drawn from Beta(spread, spread) onwards.
     """
     rng = np.random.default_rng((starts, round(100 * spread)))
     curves = [
@@ -191,7 +192,7 @@ def main() -> None:
     parser.add_argument(
         "--repeats", type=int, default=2000, help="simulated evaluations of each row"
     )
-    parser.add_argument("--resamples", type=int, default=1000, help="of each bootstrap")
+    parser.add_argument("--resamples", type=int, default=1000, help="resamples of each bootstrap")
     chosen = parser.parse_args()
     emit("coverage", {"resamples": chosen.resamples, **measure(chosen.repeats, chosen.resamples)})
 

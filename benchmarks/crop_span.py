@@ -1,14 +1,15 @@
-"""Choose the span of the endoscope's crops: how well the needle's tip is read from them.
+"""Choose the span of the endoscope's crops by how well the needle's tip can be read from them.
 
     python benchmarks/crop_span.py --episodes 60 --out outputs/crop-span
 
-The expert's episodes, rendered from the left eye and from both, whole and as crops of several spans
-about the active arm; frozen features of `--encoder`; a linear probe (`features.probe`) of the tip's
-position in world from the features and the arm's reported pose, tested on episodes that it was not
-fitted on. Prints a table and, last, one JSON object. The same command continues.
+The expert's episodes are rendered from the left eye and from both, whole and as crops of several
+spans about the active arm. From the frozen features of `--encoder` and the arm's reported pose, a
+linear probe (`features.probe`) predicts the tip's position in world; it is tested on episodes that
+it was not fitted on. Prints a table and, last, one JSON object. An interrupted run continues with
+the same command.
 
-Crops and the whole have the same number of pixels, so a smaller span is a higher resolution: at 224
-pixels 50, 30 and 20 mm are 0.22, 0.13 and 0.09 mm a pixel, and the endoscope's own sensor has 0.09.
+Crops and whole images have the same number of pixels, so a smaller span is a higher resolution: at
+224 pixels, 50, 30 and 20 mm are 0.22, 0.13 and 0.09 mm per pixel. The endoscope's sensor has 0.09.
 """
 
 import argparse
@@ -30,7 +31,7 @@ from surgicai_vision.features.probe import Probe, probe
 from surgicai_vision.scene.cameras import Crop, crop_of
 
 SPANS = (50, 30, 20)
-"""Heights of what a crop shows [mm]."""
+"""Heights of the area that a crop shows [mm]."""
 EYES = names.ENDOSCOPE_CAMERAS
 
 
@@ -40,7 +41,7 @@ def crop_name(eye: str, arm: str, span: int) -> str:
 
 
 def register_crops() -> None:
-    """Offer the crops of every eye, arm and span; workers import this module and do so as well."""
+    """Register the crops of every eye, arm and span, also in workers, which import this module."""
     for eye in EYES:
         for arm in names.ARMS:
             ours = crop_of(f"{eye}_{arm}")
@@ -55,7 +56,7 @@ register_crops()
 
 
 class Row(NamedTuple):
-    """One row of the table: what was seen, by how many eyes, and what the probe found."""
+    """One row of the table: what was seen, by how many eyes, and the probe's result."""
 
     seen: str
     eyes: int

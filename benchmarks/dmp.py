@@ -1,11 +1,11 @@
-"""Count how often movement primitives learned from demonstrations succeed from other starts.
+"""Measure how often movement primitives learned from demonstrations succeed from other starts.
 
     python benchmarks/dmp.py  # learned from our expert, every subtask
     python benchmarks/dmp.py --task insert --npz surgicai_insert_v2.npz  # from SurgicAI's
 
-Every start counts, none is drawn again. Prints one JSON object: per task the successes, the starts,
+Every start counts; none is redrawn. Prints one JSON object: per task the successes, the starts,
 the share with its 95 % Clopper-Pearson interval, the median steps, and what was learned from
-(`projected`: demonstrations that were put onto the path through the holes; see
+(`projected`: demonstrations that were projected onto the path through the holes; see
 `surgicai_vision/demos/dmp/fit.py`).
 """
 
@@ -64,23 +64,23 @@ def measure(task: str, demos: list[Path], episodes: int, seed: int, scaled: bool
 
 
 def main() -> None:
-    """Teach, execute, count, print."""
+    """Learn, execute, count and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--task", help="one subtask; all of them without it")
+    parser.add_argument("--task", help="one subtask; all subtasks by default")
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--seed", type=int, default=10_000)
     parser.add_argument("--demos-used", type=int, default=1)
     parser.add_argument(
-        "--scaled", action="store_true", help="scale the shape with g - y0, axis by axis"
+        "--scaled", action="store_true", help="scale the primitive's shape with g - y0 on each axis"
     )
     parser.add_argument(
         "--npz",
         "--pickle",
         dest="recording",
         type=Path,
-        help="a recording of SurgicAI (with --task)",
+        help="learn from a recording of SurgicAI (needs --task)",
     )
     arguments = parser.parse_args()
     if arguments.recording and not arguments.task:

@@ -1,16 +1,16 @@
 """Measure encoding speed.
 
-`Encoder` and the cached `encode` against a bare torch loop of the same network and batch.
+`Encoder` and the cached `encode` against a bare torch loop with the same network and batch.
 
     python benchmarks/encode.py --json
     python benchmarks/encode.py --encoder random --frames 512 --repeats 3
 
-The bare loop is what one would write by hand: eval mode, bfloat16 where the processor multiplies
-it, channels_last, all cores, `inference_mode`; for each batch uint8 images are normalised, passed
-on and collected as float16. It runs with our own batch and with 16, and the faster one counts.
-`cached` is `surgicai_vision.features.cache.encode` into an empty cache; its frames come from
-memory, as the bare loop's do. `--dataset DIR` adds what decoding our images costs. The ways take
-turns within one process; the best of each counts. Prints one JSON line an encoder.
+The bare loop is what one would write by hand: eval mode, bfloat16 where the processor supports it,
+channels_last, all cores, `inference_mode`. For each batch, uint8 images are normalised, encoded and
+collected as float16. It runs with our own batch and with 16, and the faster one counts. `cached` is
+`surgicai_vision.features.cache.encode` into an empty cache; its frames come from memory, like the
+bare loop's. `--dataset DIR` also measures the cost of decoding our images. The methods take turns
+within one process; the best time of each counts. Prints one JSON line per encoder.
 """
 
 import argparse
@@ -32,13 +32,11 @@ from surgicai_vision.features import encoders
 from surgicai_vision.features.cache import encode
 
 ENCODERS = ("imagenet-lite", "random", "imagenet")
-"""`random` is the ResNet-50 of `imagenet` without its weights, which make no difference to the
-speed.
-"""
+"""`random` is the ResNet-50 of `imagenet` without its weights, which do not affect the speed."""
 
 
 class Memory:
-    """Frames in memory, as `features.encode` reads a dataset."""
+    """Frames in memory that `features.encode` can read like a dataset."""
 
     views = ("back",)
     policy_views = views
@@ -94,7 +92,7 @@ def cached(source: Any, encoder: Any) -> int:
 def ways(
     name: str, weights: str | None, frames: np.ndarray, dataset: Any
 ) -> dict[str, Callable[[], int]]:
-    """Return what is timed, by name; each returns how many frames it encoded."""
+    """Return the functions to time, by name; each returns how many frames it encoded."""
     loop = bare(name, weights)
     encoder = encoders.load_encoder(name, weights=encoders.WeightsSource.of(weights))
     batch = CUDA_BATCH if torch.cuda.is_available() else BATCH
@@ -139,10 +137,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--encoder", help="one encoder", metavar="NAME")
-    parser.add_argument("--weights", help="file with its weights", metavar="FILE")
+    parser.add_argument("--encoder", help="measure only this encoder", metavar="NAME")
+    parser.add_argument("--weights", help="file with the encoder's weights", metavar="FILE")
     parser.add_argument(
-        "--dataset", help="a dataset of ours, to encode from its images", metavar="DIR"
+        "--dataset", help="a dataset of ours whose images to encode as well", metavar="DIR"
     )
     parser.add_argument("--frames", type=int, default=256)
     parser.add_argument("--repeats", type=int, default=5)

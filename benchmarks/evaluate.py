@@ -1,19 +1,19 @@
-"""Measure closed-loop evaluation.
+"""Measure the speed of closed-loop evaluation.
 
-What `evaluate` does by default against one env at a time in one process.
+The default of `evaluate` against one env at a time in one process.
 
     python benchmarks/evaluate.py
     python benchmarks/evaluate.py --episodes 8 --steps 40 --repeats 1
 
 The policy sees one view through imagenet-lite; its head is a fixed random matrix, so that no
 training is needed and every episode takes all its steps. One env at a time: one process, one slot
-(the encoder sees one frame). Default: a process for each core, eight slots in each (the encoder
-sees up to eight frames at once). Start-up of processes and the loading of the encoder count on both
-sides. Both must give the same row for every seed, and the same states.
+(the encoder sees one frame). Default: one process per core with eight slots (the encoder sees up to
+eight frames at once). Starting processes and loading the encoder are included on both sides. Both
+must give the same row and the same states for every seed.
 
-A and B take turns; figures are medians over the turns, ratios medians of the turns' ratios. Beside
-the wall's time stands the CPU time of all processes over their number: what the wall would show if
-each had a core of its own. On a machine that others use too only the latter means something.
+The two take turns; figures are medians over the turns, ratios are medians of the turns' ratios.
+Next to the wall-clock time, the CPU time of all processes divided by their number is given: the
+time it would take if each had its own core. On a shared machine only the latter is meaningful.
 """
 
 import argparse
@@ -68,13 +68,13 @@ def same(one: list[Episode], other: list[Episode]) -> int:
 
 
 def cpu_time() -> float:
-    """Return the CPU time of this process and of its ended children [s]."""
+    """Return the CPU time of this process and its finished children [s]."""
     used = os.times()
     return used.user + used.system + used.children_user + used.children_system
 
 
 def measure(episodes: int, steps: int, repeats: int) -> dict[str, Any]:
-    """Time both and compare them row by row."""
+    """Time both and compare their rows."""
     config = TaskConfig("grasp", max_steps=steps)
     seeds = range(names.TEST_SEED, names.TEST_SEED + episodes)
     kinds: tuple[dict[str, Any], ...] = ({"batch": 1, "workers": 1}, {})
@@ -112,7 +112,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--steps", type=int, default=200, help="of each episode")
+    parser.add_argument("--steps", type=int, default=200, help="control steps of each episode")
     parser.add_argument("--repeats", type=int, default=3)
     chosen = parser.parse_args()
     cores = len(os.sched_getaffinity(0))

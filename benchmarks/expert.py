@@ -1,13 +1,13 @@
-"""Count the expert's successes over many starts, with the exact 95 % interval.
+"""Measure the expert's successes over many starts, with the exact 95 % interval.
 
     python benchmarks/expert.py --task all --episodes 500
     python benchmarks/expert.py --task suture --episodes 200 --thread 10
     python benchmarks/expert.py --randomisation world --seed 500000
     python benchmarks/expert.py --randomisation pair=any,phantom_turn=10
 
-`all` are the five subtasks. Episodes whose physics diverged count as failures and are counted
-apart. `--randomisation world` draws all that is geometry at once, each axis as far as geometry
-allows (`WORLD`).
+`all` means the five subtasks. Episodes whose physics diverged count as failures and are also
+reported separately. `--randomisation world` varies all geometry at once, each axis as far as the
+geometry allows (`WORLD`).
 """
 
 import argparse
@@ -64,7 +64,7 @@ def _episode(env: envs.SuturingEnv, seed: int) -> Episode:
             _, _, terminated, truncated, info = env.step(expert.action())
             if terminated or truncated:
                 break
-    except SurgicaiError as error:  # no physical start, or a way that cannot be reached
+    except SurgicaiError as error:  # no physical start, or an unreachable path
         return Episode(seed, False, False, steps, f"{type(error).__name__}: {error}")
     end = (
         f"{names.SUBTASKS[info['phase']]} {info['d_trans'] * 1e3:.1f} mm, {info['holes_passed']}"
@@ -92,7 +92,7 @@ def table(config: TaskConfig, episodes: list[Episode]) -> dict[str, Any]:
 
 
 def read_randomisation(text: str) -> RandomisationConfig:
-    """Read "", "world" or "axis=value,…"."""
+    """Parse "", "world" or "axis=value,…"."""
     if text == "world":
         return WORLD
     changes = read_changes(text.split(",")) if text else {}
@@ -115,7 +115,7 @@ def main() -> None:
     parser.add_argument("--tissue-forces", default="phantom", choices=names.TISSUE_FORCES)
     parser.add_argument("--step", default="paper")
     parser.add_argument("--tolerance", default="paper")
-    parser.add_argument("--randomisation", default="", help='"world", or axis=value,…')
+    parser.add_argument("--randomisation", default="", help='what varies: "world" or axis=value,…')
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
     scene = SceneConfig(

@@ -1,17 +1,18 @@
-"""Measure and draw the force over depth of one insertion into soft tissue.
+"""Measure and plot force over depth for one insertion into soft tissue.
 
     python benchmarks/force_profile.py
     python benchmarks/force_profile.py --presets phantom --speed 1 --out /tmp
 
-The needle runs on rails, as in a materials testing machine: along the circle of its own arc
-through both marks of the stitch, at `--speed`, so heavy (`INERT`) that nothing turns it aside.
-Force is what resists the way: the torque of the tissue's forces about the circle's axis over its
-radius [N]. Depth is the tip's way along the circle beyond the entry's mark [mm].
+The needle is guided as in a materials testing machine: it moves along the circle of its own arc
+through both marks of the stitch, at `--speed`, and is so heavy (`INERT`) that nothing deflects it.
+The force is the resistance to this motion: the torque of the tissue's forces about the circle's
+axis, divided by its radius [N]. Depth is how far the tip is past the entry mark along the circle
+[mm].
 
 Frick, Marucci, Cartmill, Martin and Walsh (Journal of Biomechanics 34:1335, 2001) drove suture
-needles through sheepskin in such a machine: force rises as the skin tents, drops at the puncture,
-rises with the length in the tissue, peaks again where the tip leaves, drops, and stays while the
-shaft slides through.
+needles through sheepskin in such a machine: the force rises as the skin tents, drops at the
+puncture, rises with the length in the tissue, peaks again where the tip leaves, drops, and stays
+constant while the shaft slides through.
 
 Writes `force_over_depth.svg`, `.png` and `.json` into `--out`, by default `docs/`.
 """
@@ -39,12 +40,12 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion
 
 NAME = "force_over_depth"
 BEFORE = 0.003
-"""Where the tip begins, before the entry's mark [m]."""
+"""Distance of the tip before the entry mark at the beginning [m]."""
 LEFT = 0.001
-"""How much of the arc is still outside of the entry in the end [m]."""
+"""Length of the arc that is still outside the entry at the end [m]."""
 INERT = 3e4
-"""By how much the needle is heavier than it is: MuJoCo's soft constraints then give the force of
-their springs to 1 %; a thousand times is too light, a million too much for its solver."""
+"""Factor on the needle's mass: MuJoCo's soft constraints then give the force of their springs to
+1 %. A factor of a thousand is too small, a million too large for its solver."""
 COLOURS = {"phantom": "#1f4e79", "skin": "#b0563a", "liver": "#7a4f8a"}
 STAGES = {INSIDE: "in", THROUGH: "out"}
 
@@ -53,7 +54,8 @@ def insert(preset: str, speed: float) -> dict[str, Any]:
     """Drive the needle through tissue of a preset, at `speed` [m/s].
 
     Returns:
-        Depth [mm] and force [N] at every control step, and at which depth the tip went in and out.
+        Depth [mm] and force [N] at every control step, and the depths at which the tip enters and
+        leaves.
     """
     env = envs.make(TaskConfig("insert", SceneConfig(tissue="soft", tissue_forces=preset)))
     env.reset(seed=names.VALIDATION_SEED)
@@ -86,7 +88,7 @@ def insert(preset: str, speed: float) -> dict[str, Any]:
 
 
 def _on_rails(simulation: Simulation) -> None:
-    """Take the arms away and make the needle too heavy for anything to turn aside."""
+    """Disable the arms' contacts and gravity, and make the needle too heavy to be deflected."""
     model = simulation.model
     model.opt.gravity[:] = 0.0
     for arm in names.ARMS:
@@ -112,19 +114,19 @@ def _put(simulation: Simulation, pose: np.ndarray, speed: float, radius: float) 
 
 
 def _resistance(simulation: Simulation) -> float:
-    """Return the force against the needle's way along its circle [N]."""
+    """Return the force against the needle's motion along its circle [N]."""
     about_normal = int(simulation.model.joint("needle").dofadr[0]) + 5
     return float(simulation.data.qfrc_constraint[about_normal]) / simulation.radius
 
 
 def _update(simulation: Simulation, tissue: Tissue) -> None:
-    """Let the tissue look where the needle is, as after every control step."""
+    """Update the tissue for the needle's position, as after every control step."""
     mujoco.mj_forward(simulation.model, simulation.data)
     tissue.update()
 
 
 def draw(curves: dict[str, dict[str, Any]], speed: float) -> plt.Figure:
-    """Return the figure: force over depth, a line a preset; the first one's events are named."""
+    """Return the figure: force over depth, one line per preset; the first has its events named."""
     figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
     for index, (preset, curve) in enumerate(curves.items()):
         axes.plot(
@@ -146,7 +148,7 @@ def draw(curves: dict[str, dict[str, Any]], speed: float) -> plt.Figure:
 
 
 def _name_events(axes: plt.Axes, curve: dict[str, Any]) -> None:
-    """Write what happens along a curve."""
+    """Label the events along a curve."""
     depth = np.array(curve["depth_mm"])
     force = np.array(curve["force_n"])
     first = curve["events_mm"]["in"]
@@ -165,7 +167,7 @@ def _name_events(axes: plt.Axes, curve: dict[str, Any]) -> None:
 
 
 def peaks(curve: dict[str, Any]) -> dict[str, float]:
-    """Return what a reader wants to know of a curve [N], rounded."""
+    """Return a curve's key values [N], rounded."""
     depth = np.array(curve["depth_mm"])
     force = np.array(curve["force_n"])
     first = curve["events_mm"]["in"]
@@ -184,7 +186,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--presets", nargs="+", choices=tuple(COLOURS), default=tuple(COLOURS))
-    parser.add_argument("--speed", type=float, default=5.0, help="[mm/s]")
+    parser.add_argument("--speed", type=float, default=5.0, help="speed of the needle [mm/s]")
     parser.add_argument("--out", type=Path, default=Path("docs"))
     chosen = parser.parse_args()
     if not (math.isfinite(chosen.speed) and 0.0 < chosen.speed <= 20.0):

@@ -1,19 +1,19 @@
-"""Render many frames and compare every one with a live image of its state.
+"""Render many frames and compare each with a live image of its state.
 
-None dropped, black or misaligned.
+No frame may be dropped, black or misaligned.
 
     python benchmarks/frames.py --frames 10000 --workers 2 --json
 
-Demonstrations of every subtask are recorded until there are so many frames (a step seen by one view
-is a frame), and rendered by `render-demos`, two views with depth. Then, in this process, an
-environment of its own steps through each demonstration's executed actions from its seed, and what
-it sees live after each step is compared with the dataset's frame of that step, bit by bit: colours
-and depth. A frame is
+Demonstrations of every subtask are recorded until there are that many frames (a step seen by one
+view is a frame), and rendered by `render-demos`, two views with depth. Then a separate environment
+in this process replays each demonstration's executed actions from its seed. What it sees live at
+each step is compared bit by bit with the dataset's frame of that step, colours and depth. A frame
+is
 
-* dropped where the dataset has none for a step,
-* black where no pixel is above 8 of 255, or all are equal,
-* misaligned where it is not the live image of its step; `shifted` says how many equal the step
-  before or after.
+* dropped if the dataset has none for a step,
+* black if no pixel is above 8 of 255, or all are equal,
+* misaligned if it is not the live image of its step; `shifted` says how many equal the step before
+  or after.
 
 Prints one JSON object last; exits with 1 unless all are 0.
 """
@@ -35,7 +35,7 @@ VIEWS = ("front", "back")
 def compare(demos: Path, dataset_folder: Path, size: int, episode_stride: int) -> dict:
     """Count what is wrong with a dataset's frames.
 
-    One of `episode_stride` episodes is stepped through live.
+    One in `episode_stride` episodes is replayed live.
     """
     from surgicai_vision import envs
     from surgicai_vision.dataset import open_dataset
@@ -82,13 +82,13 @@ def compare(demos: Path, dataset_folder: Path, size: int, episode_stride: int) -
 
 
 def main() -> int:
-    """Record, render and compare every subtask; exit 1 where a frame is wrong."""
+    """Record, render and compare every subtask; exit 1 if a frame is wrong."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--frames", type=int, default=10_000, help="images to render, at least")
+    parser.add_argument("--frames", type=int, default=10_000, help="fewest images to render")
     parser.add_argument(
-        "--episode-stride", type=int, default=1, help="step live through one of so many episodes"
+        "--episode-stride", type=int, default=1, help="replay only every n-th episode live"
     )
     parser.add_argument("--size", type=int, default=224)
     parser.add_argument("--workers", type=int, default=2)

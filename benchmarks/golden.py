@@ -1,11 +1,11 @@
 """Compare the expert and the sweep `smoke` with the rows stored in tests/golden, number for number.
 
-    python benchmarks/golden.py                  # both; 100 starts a subtask, about six minutes
+    python benchmarks/golden.py                  # both; 100 starts per subtask, about six minutes
     python benchmarks/golden.py --only expert
-    python benchmarks/golden.py --write          # store what is there now: after a change of scene
+    python benchmarks/golden.py --write          # store the current rows, after a change of scene
 
-The stored rows are version 0.1's, made on a two-core Xeon. Physics gives the same bits on the same
-machine; on another one the last digits may differ, which `--tolerance` admits.
+The stored rows are those of version 0.1, made on a two-core Xeon. Physics gives the same bits on
+the same machine; on another one the last digits may differ, which `--tolerance` allows for.
 """
 
 import argparse
@@ -47,7 +47,7 @@ MEASURED = (
     "thread_mm",
     "paper_success",
 )
-"""Columns of an episode that a change of the house must leave as they are."""
+"""Columns of an episode that a refactoring must not change."""
 
 
 def expert_rows(folder: Path) -> pd.DataFrame:
@@ -62,7 +62,7 @@ def expert_rows(folder: Path) -> pd.DataFrame:
 
 
 def smoke_rows(folder: Path) -> pd.DataFrame:
-    """Run the sweep `smoke` from nothing and return the rows of all its runs."""
+    """Run the sweep `smoke` from scratch and return the rows of all its runs."""
     _run("sweep", "smoke", "--out", str(folder / "smoke"))
     table = pd.read_parquet(folder / "smoke" / "episodes.parquet")
     keys = ["encoder", "view", "seed"]
@@ -95,13 +95,13 @@ def _run(*arguments: str) -> None:
 
 
 def main() -> int:
-    """Compare, or store; print one JSON line; 1 where a row differs."""
+    """Compare or store; print one JSON line; return 1 if a row differs."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", choices=tuple(SUITES))
     parser.add_argument(
-        "--tolerance", type=float, default=0.0, help="largest difference of a number"
+        "--tolerance", type=float, default=0.0, help="largest allowed difference of a number"
     )
     parser.add_argument("--write", action="store_true", help="store the rows in tests/golden")
     chosen = parser.parse_args()

@@ -1,10 +1,10 @@
-"""Count how often a grasp can succeed without knowing which point of the needle is asked for.
+"""Measure how often a grasp can succeed without knowing which point of the needle is requested.
 
     python benchmarks/grasp_ceiling.py --episodes 200
 
-`once`: the expert takes the needle in the middle of the range of goals, seeing everything else.
+`once`: the expert grasps the needle in the middle of the range of goals, knowing everything else.
 `search`: it tries again elsewhere (`surgicai_vision.demos.search_expert`). Both bound what a policy
-can reach that sees images alone.
+that sees only images can achieve.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from surgicai_vision.evaluation.statistics import clopper_pearson
 
 
 class Once(SearchExpert):
-    """Takes the needle once, in the middle of the range."""
+    """Grasps the needle once, in the middle of the range."""
 
     ATTEMPTS = (12.5,)
 
@@ -30,7 +30,7 @@ WAYS: dict[str, Callable[[Any], SearchExpert]] = {"once": Once, "search": Search
 
 
 def play(seeds: range, way: str) -> list[tuple[bool, int]]:
-    """Play the seeds; success and steps of each."""
+    """Play the seeds; return success and steps of each."""
     env = envs.make(TaskConfig("grasp"))
     rows = []
     for seed in seeds:

@@ -5,9 +5,8 @@
     python benchmarks/grip.py --json
 
 Each trial draws a grasp as the subtask `place` does (angle 5°–20°, off by up to 1.5 mm and 12°)
-with the needle in free air, then swings the tool on smooth closed paths. Drift is the way of the
-grasped point in the jaws [mm] and the turn of the needle in them [deg] between the start and the
-end.
+with the needle in free air, then swings the tool along smooth closed paths. Drift is how far the
+grasped point moves in the jaws [mm], and how far the needle turns in them [deg], from start to end.
 """
 
 import argparse
@@ -34,7 +33,7 @@ PLACE = (-0.02, 0.05, 0.115)
 
 
 def swing(simulation: Simulation) -> tuple[float, float] | None:
-    """Return the drift (mm, deg) of one trial, or None when the needle was lost."""
+    """Return the drift (mm, deg) of one trial, or None if the needle was lost."""
     before = poses.compose(poses.invert(simulation.grasp(PSM2)), simulation.needle())
     step = StepSize(SPEED / FPS, TURN / FPS, 0.05)
     for index in range(int(SECONDS * FPS)):

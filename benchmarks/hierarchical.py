@@ -1,4 +1,4 @@
-"""Measure the evaluation of a hierarchical policy: what is looked at against all that could be.
+"""Measure the evaluation of a hierarchical policy: rendering on demand against every view.
 
     python benchmarks/hierarchical.py
     python benchmarks/hierarchical.py --episodes 2 --steps 40 --repeats 1
@@ -7,13 +7,13 @@ A subtask's policy sees two crops, the high-level policy all four; heads are fix
 so that no training is needed and every episode takes all its steps. Three ways take turns in one
 process:
 
-* `all`: every view is rendered in every step, and the high-level policy is asked in every step;
-* `asked`: as `all`, but it is asked every five steps;
-* `looked_at`: as `asked`, and an image is rendered when it is looked at (the default).
+* `all`: every view is rendered and the high-level policy is queried in every step;
+* `asked`: as `all`, but the high-level policy is queried every five steps;
+* `looked_at`: as `asked`, and an image is rendered only when a policy reads it (the default).
 
-The last two must give the same row for every seed, and the same states. What is
-loaded once a process is loaded before. Figures are medians over the turns, ratios medians
-of the turns' ratios by CPU time: on a machine that others use too only that means something.
+The last two must give the same row and the same states for every seed. Whatever is loaded once per
+process is loaded beforehand. Figures are medians over the turns; ratios are medians of the turns'
+ratios of CPU time, which alone is meaningful on a shared machine.
 """
 
 import argparse
@@ -44,7 +44,7 @@ from surgicai_vision.evaluation.slot import Episode
 PSM2 = ("front_psm2", "back_psm2")
 PSM1 = ("front_psm1", "back_psm1")
 LOW = (PSM2, PSM2, PSM2, PSM1, PSM1)
-"""Views of the policy of each subtask, in their order."""
+"""Views of each subtask's policy, in the order of the subtasks."""
 
 
 class Head:
@@ -64,7 +64,7 @@ class Head:
 
 
 def make_agent(encoder: str, size: int, decide_every: int) -> Agent:
-    """Make the agent; a decision comes after twenty steps at the latest."""
+    """Make the agent; it decides after at most twenty steps."""
     from surgicai_vision.features.encoders import load_encoder
 
     loaded = load_encoder(encoder)
@@ -86,7 +86,7 @@ WAYS = {
     "asked": (5, rendered_at_once),
     "looked_at": (5, contextlib.nullcontext),
 }
-"""Way → steps from question to question, and how images are rendered."""
+"""Way → steps between queries, and how images are rendered."""
 
 
 def measure(chosen: argparse.Namespace) -> dict[str, object]:
@@ -125,10 +125,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--episodes", type=int, default=8)
-    parser.add_argument("--steps", type=int, default=100, help="of each episode")
+    parser.add_argument("--steps", type=int, default=100, help="steps of each episode")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--encoder", default="imagenet-lite-early")
-    parser.add_argument("--size", type=int, default=224, help="of an image [px]")
+    parser.add_argument("--size", type=int, default=224, help="side of an image [px]")
     chosen = parser.parse_args()
     row = {**vars(chosen), **measure(chosen)}
     row["load_average"] = [round(value, 2) for value in os.getloadavg()]

@@ -1,12 +1,13 @@
-"""Kill `render-demos` with SIGKILL at random moments, and compare with a quiet run.
+"""Kill `render-demos` with SIGKILL at random moments, and compare with an undisturbed run.
 
     python benchmarks/kill.py --kills 100 --together 2 --json
 
 Each trial renders the same short demonstrations into a new folder, is killed once, and is run
-again. The moments are spread evenly over the time an undisturbed run takes under the same load (one
-in each hundredth, so that start, work and assembly are all met). Prints a line a trial and one JSON
-object last: how many datasets were identical (digest and file fingerprint), the most episodes that
-a kill cost, and what was left beside them. Exits with 1 unless all are.
+again. The moments are spread evenly over the duration of an undisturbed run under the same load
+(one in each hundredth, so that start, work and assembly are all hit). Prints one line per trial and
+one JSON object last: how many datasets were identical (digest and file fingerprint, with nothing
+left next to them), the most episodes that a kill cost, and how many kills hit unfinished work.
+Exits with 1 unless all are identical and no kill cost more episodes than there are workers.
 """
 
 import argparse
@@ -65,7 +66,7 @@ def finish(process: subprocess.Popen) -> list:
 
 
 def committed(out: Path) -> int:
-    """Return the number of finished episodes in the store beside `out`."""
+    """Return the number of finished episodes in the store next to `out`."""
     work = out.with_name(f"{out.name}.work")
     try:
         return len(
@@ -76,16 +77,16 @@ def committed(out: Path) -> int:
 
 
 def half_done(out: Path) -> int:
-    """Return the number of episodes that were being made in the store beside `out`."""
+    """Return the number of unfinished episodes in the store next to `out`."""
     return len(list(out.with_name(f"{out.name}.work").glob(".partial-*")))
 
 
 class Trials:
-    """What every trial shares.
+    """What all trials share.
 
     Attributes:
         reference: digest, fingerprint, frames and episodes of the undisturbed run.
-        duration: its time under the trials' own load [s].
+        duration: its duration under the load of the trials [s].
     """
 
     def __init__(self, root: Path, episodes: int, workers: int, together: int):
@@ -105,7 +106,7 @@ class Trials:
         assert all(result == self.reference for result in results)
 
     def run(self, trial: int, moment: float) -> dict:
-        """Kill one rendering after `moment` seconds, run it again, and say what came of it."""
+        """Kill one rendering after `moment` seconds, run it again, and return the outcome."""
         out = self.root / f"set{trial}"
         process = start(self.script, self.root / "demos", out, self.workers)
         time.sleep(moment)
@@ -137,7 +138,7 @@ def main() -> int:
     )
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--workers", type=int, default=1, help="processes of each rendering")
-    parser.add_argument("--together", type=int, default=2, help="trials at a time")
+    parser.add_argument("--together", type=int, default=2, help="trials that run at a time")
     parser.add_argument("--episodes", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(

@@ -1,11 +1,11 @@
-"""Count how often demonstrations re-posed to other starts succeed.
+"""Measure how often demonstrations re-posed to other starts succeed.
 
     python benchmarks/multiply.py  # ten of the expert's, every subtask
     python benchmarks/multiply.py --task insert --npz surgicai_insert_v2.npz  # ten of SurgicAI's
     python benchmarks/multiply.py --task grasp --demos outputs/demos/search
 
-Every start counts, none is drawn again. Prints one JSON object: per task and way to choose the
-source the successes, the starts, the share with its 95 % Clopper-Pearson interval, and the median
+Every start counts; none is redrawn. Prints one JSON object: per task and method of choosing the
+source, the successes, the starts, the share with its 95 % Clopper-Pearson interval, and the median
 steps of successes.
 """
 
@@ -33,7 +33,7 @@ from surgicai_vision.evaluation.statistics import clopper_pearson
 def measure(
     config: TaskConfig, demos: list[Path], episodes: int, seed: int, source: str, noise: float
 ) -> dict[str, Any]:
-    """Re-pose `demos` to `episodes` starts."""
+    """Re-pose `demos` to `episodes` starts and return the successes."""
     env = envs.make(config)
     steps = []
     for number in range(seed, seed + episodes):
@@ -51,19 +51,21 @@ def measure(
 
 
 def main() -> None:
-    """Take demonstrations, re-pose, count, print."""
+    """Take demonstrations, re-pose them, count and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--task", choices=names.TASKS, help="all subtasks without it")
+    parser.add_argument("--task", choices=names.TASKS, help="task; all subtasks by default")
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--seed", type=int, default=10_000)
     parser.add_argument("--demos-used", type=int, default=10)
-    parser.add_argument("--source", choices=SOURCES, help="both without it")
+    parser.add_argument(
+        "--source", choices=SOURCES, help="how to choose the source; both ways by default"
+    )
     parser.add_argument("--noise", type=float, default=0.0)
-    parser.add_argument("--world", action="store_true", help="to starts in the varied world")
-    parser.add_argument("--npz", type=Path, help="a recording of SurgicAI (with --task)")
-    parser.add_argument("--demos", type=Path, help="a folder of demonstrations (with --task)")
+    parser.add_argument("--world", action="store_true", help="use starts in the varied world")
+    parser.add_argument("--npz", type=Path, help="a recording of SurgicAI (needs --task)")
+    parser.add_argument("--demos", type=Path, help="a folder of demonstrations (needs --task)")
     arguments = parser.parse_args()
     if (arguments.npz or arguments.demos) and not arguments.task:
         parser.error("--npz and --demos need --task")

@@ -3,17 +3,16 @@
     python benchmarks/press.py
     python benchmarks/press.py --tissue soft --torque dvrk
 
-Each of the random policies is what an untrained network is to the arm: one action, drawn once and
-repeated for the whole episode, here among those that lead into the tissue: at full step size from
-the tip's start to a point anywhere within `REACH` of the stitch, with a random turn of the tool.
-Policies with an even number drive PSM2 from a start of `grasp`, the others PSM1 from one of
-`handoff`.
+Each random policy acts like an untrained network: one action, drawn once and repeated for the whole
+episode. Here it is drawn from actions that lead into the tissue: at full step size from the tip's
+start to a point anywhere within `REACH` of the stitch, with a random turn of the tool. Policies
+with an even number drive PSM2 from a start of `grasp`, the others PSM1 from one of `handoff`.
 
-* peak: the largest net force on the phantom in the episode, over every physics step of 2 ms, the
-  impact included; `peak_50hz_n` as evaluations see it, once a control step.
-* held: the median over the last second, when the impact is over.
+* peak: the largest net force on the phantom in the episode, over every physics step of 2 ms,
+  including the impact; `peak_50hz_n` as evaluations see it, once per control step.
+* held: the median over the last second, after the impact.
 
-Both in N, over the policies that touched the tissue: median, 90 % quantile, largest.
+Both are in N, over the policies that touched the tissue: median, 90 % quantile, largest.
 """
 
 import argparse
@@ -33,9 +32,9 @@ from surgicai_vision.scene.holes import SURFACE
 
 STEPS = 200
 REACH = (0.015, 0.020)
-"""How far to either side of the stitch, in world x and y, the policies aim [m]."""
+"""How far to either side of the stitch the policies aim, in world x and y [m]."""
 TURN = 0.1
-"""Largest turn a step, of the step size: up to 40° about each axis in an episode."""
+"""Largest turn per step, as a share of the step size: up to 40° about each axis per episode."""
 HELD = names.FPS
 """Control steps at the end of an episode over which the held force is measured: 1 s."""
 TASKS = ("grasp", "handoff")
@@ -57,10 +56,10 @@ class Press(NamedTuple):
 
 
 class FinePlate:
-    """The force plate at every physics step: each control step is played once more beside the env.
+    """The force plate at every physics step: each control step is replayed outside the env.
 
     Args:
-        env: the env to read; `before` and `after` stand around each of its steps.
+        env: the env to read; call `before` and `after` around each of its steps.
     """
 
     def __init__(self, env: envs.SuturingEnv):
@@ -70,11 +69,11 @@ class FinePlate:
         self._state = np.empty(mujoco.mj_stateSize(env.model, STATE))
 
     def before(self) -> None:
-        """Remember the state that a control step begins in."""
+        """Store the state at the beginning of a control step."""
         mujoco.mj_getState(self._env.model, self._env.data, self._state, STATE)
 
     def after(self) -> tuple[float, float]:
-        """Return the largest force in the control step and that at its end [N]."""
+        """Return the largest force in the control step and the force at its end [N]."""
         model = self._env.model
         again = self._again
         mujoco.mj_setState(model, again, self._state, STATE)

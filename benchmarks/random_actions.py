@@ -4,15 +4,15 @@
     python benchmarks/random_actions.py --episodes 1000 --hold 25 --thread 10
     python benchmarks/random_actions.py --tissue soft --mid-insertion 0.5 --out /tmp/random.jsonl
 
-Each episode takes up to 200 steps of uniform random actions, each kept for `--hold` steps (long
-holds drive the tools to the ends of their reach and into everything). Counted are episodes that
-ended as `physics_error`, episodes in which MuJoCo warned of divergence and no error was reported,
-and observations that are not finite.
+Each episode takes up to 200 steps of uniform random actions, each held for `--hold` steps (long
+holds drive the tools to the limits of their reach and into everything). Counts the episodes that
+ended as `physics_error`, the episodes in which MuJoCo warned of divergence but no error was
+reported, and the observations that are not finite.
 
-`--mid-insertion SHARE` of the episodes begin with the needle in the tissue: in equal parts at
-starts of `handoff` and of `pullout`, and half-way through `insert`: the expert drives until the tip
-is through the entry and up to `DEEPER` steps more. The others are shared among all five subtasks.
-With `--out` an interrupted run goes on where it was.
+`--mid-insertion SHARE` of the episodes begin with the needle in the tissue, in equal parts at
+starts of `handoff`, at starts of `pullout`, and half-way through `insert`: the expert drives until
+the tip is through the entry, and up to `DEEPER` steps more. The others are shared among all five
+subtasks. With `--out`, an interrupted run continues where it stopped.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from surgicai_vision.demos.expert import Expert
 
 STEPS = 200
 DEEPER = 40
-"""Steps at most that the expert goes on once the tip is in the tissue: the half of an insertion."""
+"""Most steps that the expert continues once the tip is in the tissue: half of an insertion."""
 INSIDE = ("insert", "handoff", "pullout")
 """Subtasks of the episodes that begin in the tissue."""
 DIVERGED = tuple(
@@ -59,7 +59,7 @@ KEYS = (
 
 
 class Job(NamedTuple):
-    """Some episodes of one task, from its starts or from half-way."""
+    """Some episodes of one task, from its starts or from within the tissue."""
 
     config: TaskConfig
     seeds: range
@@ -112,7 +112,7 @@ def _episode(env: envs.SuturingEnv, seed: int, job: Job) -> Counter[str]:
 
 
 def _drive_in(env: envs.SuturingEnv, deeper: int) -> None:
-    """Let the expert drive the needle through the entry and `deeper` steps on."""
+    """Let the expert drive the needle through the entry and `deeper` steps further."""
     expert = Expert(env)
     left = env.config.max_steps
     while left:
@@ -125,7 +125,7 @@ def _drive_in(env: envs.SuturingEnv, deeper: int) -> None:
 
 
 def jobs_of(chosen: argparse.Namespace) -> list[Job]:
-    """Return the jobs of a command line: its episodes from starts, then those from half-way."""
+    """Return a command line's jobs: episodes from starts, then those from within the tissue."""
     scene = SceneConfig(thread=chosen.thread, tissue=chosen.tissue)
     inside = round(chosen.episodes * chosen.mid_insertion)
     jobs = []
@@ -148,17 +148,17 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--episodes", type=int, default=10_000, help="in all, shared among the subtasks"
+        "--episodes", type=int, default=10_000, help="episodes in all, shared among the subtasks"
     )
     parser.add_argument("--seed", type=int, default=names.TEST_SEED)
     parser.add_argument("--thread", type=int, default=0)
     parser.add_argument("--tissue", default=SceneConfig().tissue)
     parser.add_argument(
-        "--mid-insertion", type=float, default=0.0, help="share that begins in the tissue"
+        "--mid-insertion", type=float, default=0.0, help="share of episodes begun in the tissue"
     )
     parser.add_argument("--hold", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path, help="keep what is done, and go on from it")
+    parser.add_argument("--out", type=Path, help="file of finished jobs to continue from")
     chosen = parser.parse_args()
     if not 0.0 <= chosen.mid_insertion <= 1.0:
         parser.error(f"--mid-insertion is {chosen.mid_insertion}; allowed: 0 to 1.")

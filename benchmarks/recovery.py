@@ -1,10 +1,10 @@
-"""Count how often the recovery expert ends a whole procedure in which one thing went wrong.
+"""Measure how often the recovery expert completes a whole procedure after one upset.
 
     python benchmarks/recovery.py --episodes 160 --noise 0.3
 
-Every episode has one upset (`surgicai_vision.envs.upset`), drawn from its seed. The last row, none,
-is the same starts and noise without one. An upset that had not happened when its episode ended
-counts as none.
+Every episode has one upset (`surgicai_vision.envs.upset`), drawn from its seed. The last row,
+`none`, has the same starts and noise without an upset. An upset that had not happened when its
+episode ended counts as `none`.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from surgicai_vision.evaluation.statistics import clopper_pearson
 
 
 def play(seeds: range, fraction: float, noise: float) -> list[tuple[str, bool, str]]:
-    """Play the seeds; what went wrong, whether it ended well, and why not."""
+    """Play the seeds; return for each its upset, whether it succeeded, and why not."""
     env = envs.make(TaskConfig(names.SUTURE))
     wrong = Disturbance(noise=noise, upset_fraction=fraction)
     rows = []

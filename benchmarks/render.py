@@ -1,14 +1,14 @@
-"""Measure two-view steps/s written.
+"""Measure how many two-view steps/s are written.
 
 `render-demos` with 1 and 2 workers against LeRobot's own writer in one process.
 
     python benchmarks/render.py --episodes 12 --repeats 3 --json
 
-The same demonstrations, 224 × 224, lossless images, each way in a process of its own. The other way
-sets every state in the same environment, renders both views and writes with
-`LeRobotDataset.add_frame` and `save_episode` (`use_videos=False`); its clock starts after LeRobot's
-imports, ours before the workers start. The ways take turns; the best counts. Prints one JSON object
-last.
+Both write the same demonstrations as lossless images of 224 × 224, each in a separate process. For
+LeRobot's writer, every state is set in the same environment, both views are rendered and written
+with `LeRobotDataset.add_frame` and `save_episode` (`use_videos=False`). Its clock starts after
+LeRobot's imports, ours before the workers start. They take turns; the best of each counts. Prints
+one JSON object last.
 """
 
 import argparse

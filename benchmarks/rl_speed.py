@@ -1,12 +1,12 @@
-"""Measure reinforcement learning against the bare library.
+"""Measure the speed of reinforcement learning against the bare library.
 
     python benchmarks/rl_speed.py --turns 3 --steps 300
 
-Updates and control steps a second of CPU time, in the training loop: Stable-Baselines3's TD3 with
-its own HER buffer on a trivial env of the same shapes, whose step is a copy of an array, against
-`train --algo td3-her` on Grasp with its relative features and its physics. The same networks, batch
-and updates a step; they take turns, and the ratio is the median of the turns' ratios. Learning has
-begun before the clock is started.
+Measures updates and control steps per second of CPU time in the training loop: Stable-Baselines3's
+TD3 with its own HER buffer on a trivial env of the same shapes, whose step only copies an array,
+against `train --algo td3-her` on Grasp with its relative features and its physics. Networks, batch
+and updates per step are the same. The two take turns, and the ratio is the median of the turns'
+ratios. Learning has begun before the clock is started.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from surgicai_vision.rl.online import OnlineLearner
 from surgicai_vision.rl.settings import Request, settings_of
 
 WARM_UP = 230
-"""Control steps before the clock is started: an episode, which hindsight needs, and updates."""
+"""Control steps before the clock starts: an episode, which hindsight needs, and some updates."""
 
 
 class Trivial(gymnasium.Env):
@@ -73,7 +73,7 @@ def bare(settings: Any) -> TD3:
 
 
 def rate(model: Any, steps: int) -> float:
-    """Return control steps a second of CPU time."""
+    """Return control steps per second of CPU time."""
     began = time.process_time()
     model.learn(steps, reset_num_timesteps=False)
     return steps / (time.process_time() - began)

@@ -1,17 +1,17 @@
-"""Measure a policy at the served simulation: successes, jitter and latency.
+"""Measure a policy on the served simulation: successes, jitter and latency.
 
     python benchmarks/robot.py --episodes 50
     python benchmarks/robot.py --policy released:grasp --episodes 2 --clock stepped
 
-`robot serve` and `robot drive`, a process each, over a transport on the loopback; beside them the
-same policy and starts in one process (`evaluate`). Where the client steps the clock, every episode
-must have the same end after the same steps. In real time the served simulation is asked how late
-its control steps began, and the driver how long after the newest pose and the newest image it sent:
-a shared machine says nothing about either, and the load average of the minute before stands beside
-them (two to three are the benchmark's own).
+`robot serve` and `robot drive` run in a process each, over a transport on the loopback; for
+comparison, the same policy and starts run in one process (`evaluate`). When the client steps the
+clock, every episode must end in the same way after the same steps. In real time, the served
+simulation reports how late its control steps began, and the driver how long after the newest pose
+and the newest image it sent. On a shared machine neither is meaningful; the load average of the
+last minute is reported with them (the benchmark itself causes two to three).
 
-Ten episodes at a time; what was counted is kept in `--out`/counted.jsonl, and the same command goes
-on from there. `--out`/robot.json has the result.
+Runs ten episodes at a time. Finished ones are kept in `--out`/counted.jsonl, and the same command
+continues from there. The result is in `--out`/robot.json.
 """
 
 import argparse
@@ -44,15 +44,15 @@ COMMAND = (sys.executable, "-m", "surgicai_vision", "robot")
 IN_PROCESS = "in process"
 CLOCKS = ("stepped", "real")
 CHUNK = 10
-"""Episodes that are counted at a time, and lost if it breaks off."""
+"""Episodes that run at a time, and are lost if the run is interrupted."""
 BEGINS_S = 120.0
 ENDS_S = 30.0
-"""Time that `robot serve` has to begin, and to end after Ctrl-C [s]."""
+"""Time limits for `robot serve` to begin, and to end after Ctrl-C [s]."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Episodes to be counted: `repr` names them in the file of what was counted."""
+    """Episodes to run: their `repr` identifies them in the file of finished jobs."""
 
     way: str
     policy: str
@@ -63,7 +63,7 @@ class Job:
 
 
 def count(job: Job, domain: int) -> dict[str, Any]:
-    """Count a job's episodes: success, steps and subtasks of each, and how late things were."""
+    """Run a job's episodes: return success, steps and subtasks of each, and the delays."""
     begun = time.monotonic()
     counted = in_process(job) if job.way == IN_PROCESS else at_robot(job, domain)
     done = counted["episodes"]
@@ -79,13 +79,13 @@ def count(job: Job, domain: int) -> dict[str, Any]:
 
 @functools.cache
 def opened(policy: str) -> tuple[PolicySpec, Agent]:
-    """Return a policy, and an agent of it."""
+    """Return a policy and an agent that runs it."""
     spec = open_policy(policy)
     return spec, spec.make_agent()
 
 
 def in_process(job: Job) -> dict[str, Any]:
-    """Count in this process and its workers."""
+    """Run a job in this process and its workers."""
     spec, _ = opened(job.policy)
     seeds = range(job.first, job.first + job.count)
     rows = [entry.row for entry in evaluate(spec.make_agent, spec.config, seeds)]
@@ -93,7 +93,7 @@ def in_process(job: Job) -> dict[str, Any]:
 
 
 def at_robot(job: Job, domain: int) -> dict[str, Any]:
-    """Count by `robot serve` and `robot drive`."""
+    """Run a job with `robot serve` and `robot drive`."""
     spec, agent = opened(job.policy)
     network = ("--transport", job.transport, "--domain", str(domain), "--clock", job.way)
     serve = [*COMMAND, "serve", "--task", spec.config.task, "--advance", spec.config.advance]
@@ -133,7 +133,7 @@ def at_robot(job: Job, domain: int) -> dict[str, Any]:
 
 @contextmanager
 def serving(command: list[str], said: Path, log: Path) -> Iterator[None]:
-    """Run `robot serve` beside; `said` holds what it printed once it has ended."""
+    """Run `robot serve` in parallel; `said` holds what it printed once it has ended."""
     with said.open("w") as out, log.open("w") as notes:
         server = subprocess.Popen(command, stdout=out, stderr=notes)
     try:
@@ -181,7 +181,7 @@ def result(jobs: list[Job], counted: list[dict[str, Any]]) -> dict[str, Any]:
         if way == "real":
             solved = sum(subtasks for _, _, subtasks in own)
             sums["subtasks_over_in_process"] = round(sums["subtasks"] / max(solved, 1), 3)
-            for name in ("late", "latency", "image_latency"):  # each ten's; the worst counts
+            for name in ("late", "latency", "image_latency"):  # per ten episodes; the worst counts
                 for of in ("median", "p99"):
                     key = f"{name}_ms_{of}"
                     sums[key] = round(max(part[key] for part in parts[way]), 2)
@@ -203,7 +203,7 @@ def main() -> None:
     parser.add_argument("--domain", type=int, default=211)
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/robot"))
     chosen = parser.parse_args()
-    # A shell's background jobs ignore Ctrl-C, and so would `robot serve`, which is ended by it.
+    # A shell's background jobs ignore Ctrl-C; `robot serve` would inherit this, but ends by Ctrl-C.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     clocks = CLOCKS if chosen.clock == "both" else (chosen.clock,)
     code = code_version()

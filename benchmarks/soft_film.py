@@ -1,16 +1,16 @@
-"""Show soft tissue: a film of an insertion with the force beside it, and close-ups of the skin.
+"""Show soft tissue: a film of an insertion with its force curve, and close-ups of the skin.
 
     python benchmarks/soft_film.py
     python benchmarks/soft_film.py --out /tmp --tissue-forces skin --seed 500007
 
-The expert throws a stitch; the endoscope's left eye looks at it, cut from a larger image about the
+The expert throws a stitch, seen by the endoscope's left eye, cut from a larger image about the
 marks.
 
-* `soft_tissue.mp4`: the insertion, one control step of 20 ms a frame at `FPS` frames a second, and
-  the force on the tissue as the force plate shows it.
+* `soft_tissue.mp4`: the insertion, one control step of 20 ms per frame at `FPS` frames per second,
+  and the force on the tissue as measured by the force plate.
 * `soft_tissue.jpg`: what the skin does: the tip presses, is in, lifts the skin from inside, is out;
-  the needle is drawn through; the wounds that stay. Last, jaws that dent the flat tissue, and
-  tissue that a needle tore which was driven along the wound.
+  the needle is drawn through; the wounds remain. Last, jaws that dent the flat tissue, and tissue
+  torn by a needle that was driven along the wound.
 """
 
 import argparse
@@ -42,16 +42,16 @@ from surgicai_vision.scene.rendering import FrameRenderer
 NAME = "soft_tissue"
 CAMERA = "endo_left"
 FPS = 15
-"""Frames a second: control steps at 0.3 of their speed."""
+"""Frames per second: control steps at 0.3 of their speed."""
 FILM = (480, 640)
-"""Height and width of the endoscope's part of the film [px]; the curve beside it is half as
+"""Height and width of the endoscope's part of the film [px]; the curve next to it is half as
 wide."""
 CLOSE = (300, 400)
-"""Of a close-up [px]."""
+"""Height and width of a close-up [px]."""
 WIDE_MM = 26.0
-"""What the film shows across the stitch [mm]."""
+"""Width that the film shows at the stitch [mm]."""
 CLOSE_MM = 13.0
-"""What a close-up shows."""
+"""Width that a close-up shows [mm]."""
 SLIDE_STEPS = 60
 """Control steps for which the needle is driven along the wound to tear the tissue."""
 
@@ -62,7 +62,7 @@ class Eye:
     Args:
         env: an env with soft tissue.
         size: height and width of the images [px].
-        width_mm: what they show across at the point [mm].
+        width_mm: width that they show at the point [mm].
     """
 
     def __init__(self, env: envs.SuturingEnv, size: tuple[int, int], width_mm: float):
@@ -74,7 +74,7 @@ class Eye:
         )
 
     def look(self, at: Point) -> Image:
-        """Return the image about a point in world [m], as far as the eye sees it."""
+        """Return the image about a point [m, world], shifted to stay within the camera's image."""
         model = self._env.model
         data = self._env.data
         camera = model.camera(CAMERA).id
@@ -109,7 +109,7 @@ def middle(env: envs.SuturingEnv) -> Point:
 
 
 def film(scene: SceneConfig, seed: int, path: Path) -> dict[str, float]:
-    """Film an insertion; return its peak force [N] and its frames."""
+    """Film an insertion; return its peak force [N] and its number of frames."""
     env = envs.make(TaskConfig("insert", scene))
     env.reset(seed=seed)
     plate = ForcePlate(env.model, tissue_of(env))
@@ -131,7 +131,7 @@ def film(scene: SceneConfig, seed: int, path: Path) -> dict[str, float]:
 
 
 def draw_curves(forces: NDArray[np.float64], dt: float) -> list[Image]:
-    """Return the curve of the force up to each step, one image a step."""
+    """Return the force curve up to each step, one image per step."""
     height, width = FILM
     figure, axes = plt.subplots(figsize=(width / 200, height / 100), dpi=100, layout="constrained")
     times = dt * np.arange(len(forces))
@@ -159,7 +159,7 @@ def close_ups(scene: SceneConfig, seed: int) -> list[tuple[str, Image]]:
 
 
 def _stitch(scene: SceneConfig, seed: int) -> list[tuple[str, Image]]:
-    """Throw a stitch; take the last moment of each stage."""
+    """Throw a stitch; return the last image of each stage."""
     env = envs.make(TaskConfig("suture", scene))
     env.reset(seed=seed)
     tissue = tissue_of(env)
@@ -186,7 +186,7 @@ def _stitch(scene: SceneConfig, seed: int) -> list[tuple[str, Image]]:
 
 
 def _jaws(scene: SceneConfig, seed: int) -> tuple[str, Image]:
-    """Grasp; take the moment of the deepest dent."""
+    """Grasp; return the image of the deepest dent."""
     env = envs.make(TaskConfig("grasp", scene))
     env.reset(seed=seed)
     skin = Skin(env.simulation, tissue_of(env))
@@ -234,7 +234,7 @@ def _until(
 
 
 def write_sheet(images: list[tuple[str, Image]], path: Path) -> None:
-    """Write titled images as one, four in a row."""
+    """Write titled images as one, four per row."""
     columns = 4
     rows = -(-len(images) // columns)
     figure, axes = plt.subplots(
@@ -253,7 +253,7 @@ def write_sheet(images: list[tuple[str, Image]], path: Path) -> None:
 
 
 def main() -> None:
-    """Film, look, and print one JSON line."""
+    """Film, take the close-ups, and print one JSON line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

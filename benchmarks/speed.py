@@ -1,6 +1,6 @@
 """Measure speed.
 
-Physics, images, resets and workers, each against the bare thing at equal settings.
+Physics, images, resets and workers, against the bare libraries at equal settings.
 
     python benchmarks/speed.py
     python benchmarks/speed.py --only step --repeats 40
@@ -9,27 +9,26 @@ Physics, images, resets and workers, each against the bare thing at equal settin
   `mj_step(…, nstep)` over the same model, states and commands. Both must end in the same positions.
   Without thread and with 10 segments.
 * tissue: `env.step` along an expert's whole procedure in tissue "soft" against "channels", each
-  with a procedure of its own; steps/s of the one over those of the other. Without thread and with
-  10 segments.
-* frames: `FrameRenderer.render` against `mujoco.Renderer` with shadows, multisampling and triangles
-  set alike, on the same states. Both must give the same pixels. One core: llvmpipe draws in the
+  with its own procedure; ratio of their steps/s. Without thread and with 10 segments.
+* frames: `FrameRenderer.render` against `mujoco.Renderer` with the same shadows, multisampling and
+  triangles, on the same states. Both must give the same pixels. One core: llvmpipe draws in the
   calling thread.
-* crop: `env.image` of a crop against a camera that aims at the jaws, as 0.1 had it: the same size,
-  stand and field of view.
-* looks: frames of episodes each with a look of its own (`randomisation: appearance`) against the
-  same episodes again, whose looks are drawn already, and against episodes of the plain look. An
+* crop: `env.image` of a crop against a camera that aims at the jaws, as in version 0.1, with the
+  same size, position and field of view.
+* looks: frames of episodes that each have their own look (`randomisation: appearance`), against the
+  same episodes again, whose looks are already drawn, and against episodes of the plain look. An
   episode is a reset and 200 observations of two views.
-* skin: images of every state of an expert's procedure in soft tissue, with the skin that follows
-  the state and with whole skin; two views a state, as policies have them. And in channels.
+* skin: images of every state of an expert's procedure in soft tissue, with a skin that follows the
+  state and with an intact skin; two views per state, as for policies. Also in channels.
 * reset: per task [ms].
-* workers: two worker processes against one, steps of all envs a second: gymnasium's asynchronous
-  vector env (`async_…`, an env a worker) and ours (`shares_…`, `--share` envs a worker), with state
-  and with images.
+* workers: two worker processes against one, in steps of all envs per second: gymnasium's
+  asynchronous vector env (`async_…`, one env per worker) and ours (`shares_…`, `--share` envs per
+  worker), with state and with images.
 * help: `--help` as a whole process [s].
 
-A and B take turns; figures are medians over the turns, and ratios are medians of the turns' ratios.
-`--clock cpu` counts the process's own CPU time instead of the wall's, for a machine that others use
-too; workers and help are timed by the wall in any case.
+The two sides take turns; figures are medians over the turns, and ratios are medians of the turns'
+ratios. `--clock cpu` uses the process's CPU time instead of wall-clock time, for a shared machine;
+workers and help are always timed by the wall clock.
 """
 
 import argparse
@@ -74,7 +73,7 @@ POSES = 16
 class Recording(NamedTuple):
     """An expert's episode.
 
-    The env, its first state, the actions, and the servo commands they became.
+    The env, its first state, the actions, and the resulting servo commands.
     """
 
     env: envs.SuturingEnv
@@ -87,7 +86,7 @@ CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
 
 class Clock:
-    """What tells the time; chosen on the command line."""
+    """The clock used for all timing; chosen on the command line."""
 
     now = staticmethod(CLOCKS["wall"])
 
@@ -102,9 +101,9 @@ def timed(function: Callable[[], Any]) -> float:
 def in_turns(
     one: Callable[[], None], other: Callable[[], None], repeats: int
 ) -> tuple[list[float], list[float]]:
-    """Return the times of two calls [s] that take turns, first one first, then the other.
+    """Return the times [s] of two calls that take turns; which one goes first alternates.
 
-    The first turn is lost.
+    The first turn is discarded.
     """
     times: tuple[list[float], list[float]] = ([], [])
     for turn in range(repeats + 1):
@@ -249,7 +248,7 @@ def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
 
 
 def measure_crop(repeats: int, frames: int) -> dict[str, Any]:
-    """Time a crop against a camera that follows the jaws, on the same states."""
+    """Time a crop against a camera that aims at the jaws, on the same states."""
     env, start, actions, _ = record(SceneConfig())
     spec = build_spec(env.config.scene)
     crop = crop_of(CROP)
@@ -298,7 +297,7 @@ def measure_crop(repeats: int, frames: int) -> dict[str, Any]:
 
 
 def _set_quality(model: mujoco.MjModel) -> None:
-    """Set a model to the settings of our quality "fast"."""
+    """Give a model the settings of our quality "fast"."""
     quality = QUALITIES["fast"]
     visual = model.vis.quality
     visual.offsamples = quality.samples
@@ -308,7 +307,7 @@ def _set_quality(model: mujoco.MjModel) -> None:
 
 
 def measure_looks(repeats: int) -> dict[str, Any]:
-    """Time the images of episodes with new looks, with looks seen before, and with none."""
+    """Time the images of episodes with new looks, with repeated looks, and with the plain look."""
     plain, looking = (
         envs.make(
             TaskConfig("place", randomisation=RandomisationConfig(appearance=appearance)),
@@ -347,7 +346,7 @@ def measure_looks(repeats: int) -> dict[str, Any]:
 
 
 def measure_skin(repeats: int) -> dict[str, Any]:
-    """Time images of soft tissue whose skin follows the state against images of whole skin."""
+    """Time images of soft tissue whose skin follows the state against images of an intact skin."""
     rates: dict[str, list[float]] = {"following": [], "whole": [], "channels": []}
     filmed = {kind: _states(SceneConfig(tissue=kind)) for kind in ("soft", "channels")}
     env = filmed["soft"][0]
@@ -360,7 +359,7 @@ def measure_skin(repeats: int) -> dict[str, Any]:
         for _ in range(repeats):
             rates["following"].append(_rate(*filmed["soft"], following))
             env.set_state_vector(filmed["soft"][1][0])
-            following.render(env.data, CAMERA)  # the first state's skin is whole
+            following.render(env.data, CAMERA)  # the first state's skin is intact
             with FrameRenderer(env.model, SIZE, SIZE) as whole:
                 rates["whole"].append(_rate(*filmed["soft"], whole))
             rates["channels"].append(_rate(*filmed["channels"], channels))
@@ -383,7 +382,7 @@ def _states(scene: SceneConfig) -> tuple[envs.SuturingEnv, list[np.ndarray]]:
 
 
 def _rate(env: envs.SuturingEnv, states: list[np.ndarray], renderer: FrameRenderer) -> float:
-    """Return images a second, two a state; restoring it is not counted."""
+    """Return images per second, two per state; restoring the state is not timed."""
     seconds = 0.0
     for state in states:
         env.set_state_vector(state)
@@ -412,7 +411,7 @@ def measure_workers(repeats: int, steps: int, obs_type: str, share: int) -> dict
         repeats: turns.
         steps: vector steps in a turn.
         obs_type: what the envs show.
-        share: envs of a worker of ours; 0 for gymnasium's asynchronous vector env.
+        share: envs per worker of our vector env; 0 for gymnasium's asynchronous vector env.
     """
     chosen = {
         "obs_type": obs_type,
@@ -466,7 +465,7 @@ def main() -> None:
     parser.add_argument("--only", choices=parts, nargs="+", default=parts)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--frames", type=int, default=100, help="frames or vector steps in a turn")
-    parser.add_argument("--share", type=int, default=16, help="envs of a worker of ours")
+    parser.add_argument("--share", type=int, default=16, help="envs per worker of our vector env")
     parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
     chosen = parser.parse_args()
     Clock.now = staticmethod(CLOCKS[chosen.clock])

@@ -1,15 +1,15 @@
 """Run a sweep of many small cells while its workers, its driver and a node are killed.
 
-Compare with a quiet run.
+Compare with an undisturbed run.
 
     python benchmarks/sweep_kill.py --cells 300 --json
 
-Three runs of the same grid: a quiet one; one by local processes, of which ten workers and once the
-driver are killed; one on a Ray cluster of two nodes on loopback, where a node is lost too. The
-sweep is started again after its driver's death, which is all the repair there is. A last call of
-the quiet run's command shows what a finished sweep costs. A cell is a policy without images: two
-epochs, one episode. Prints one JSON object last; exits with 1 unless every run has every cell once
-and the quiet run's digest.
+Runs the same grid three times: undisturbed; with local processes, where workers are killed ten
+times and the driver once; and on a Ray cluster of two nodes on loopback, where a node is lost as
+well. After the driver is killed, the sweep is started again; nothing else is repaired. A second
+call of the undisturbed command shows what a finished sweep costs. A cell is a policy without
+images: two epochs, one episode. Prints one JSON object last; exits with 1 unless every run has
+every cell once and the undisturbed run's digest.
 """
 
 import argparse
@@ -42,12 +42,12 @@ size: 32
 
 
 class Sweep:
-    """One sweep in a folder of its own.
+    """One sweep in its own folder.
 
     Args:
-        grid: its file.
-        out: its folder.
-        options: more options of the command.
+        grid: file of its grid.
+        out: its output folder.
+        options: further options of the command.
     """
 
     def __init__(self, grid: Path, out: Path, *options: str):
@@ -67,27 +67,27 @@ class Sweep:
         self.process: subprocess.Popen | None = None
 
     def start(self) -> None:
-        """Start it, or start it again."""
+        """Start or restart the sweep."""
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(self.command, stdout=pipe, stderr=pipe, text=True)
         self.starts += 1
 
     def filed(self) -> int:
-        """Return how many cells are in their place."""
+        """Return the number of finished cells."""
         try:
             return len(os.listdir(self.out / "runs"))
         except OSError:
             return 0
 
     def kill_driver(self) -> bool:
-        """Kill the command itself and give it again."""
+        """Kill the command itself and start it again."""
         self.process.kill()
         self.process.communicate()
         self.start()
         return True
 
     def run(self, events: list[tuple[int, Callable[[], bool]]]) -> dict:
-        """Run to the end, with what happens on the way; return its last line and the time [s]."""
+        """Run to the end, with events on the way; return the last line printed and the time [s]."""
         began = time.monotonic()
         self.start()
         while self.process.poll() is None:
@@ -103,7 +103,7 @@ class Sweep:
         }
 
     def verdict(self, result: dict, digest: str, cells: int) -> dict:
-        """Return what is in the folder beside what should be."""
+        """Return a comparison of what is in the folder with what should be."""
         import pyarrow.parquet as pq
 
         rows = pq.read_table(self.out / "episodes.parquet", columns=["run", "seed"]).to_pylist()
@@ -120,14 +120,14 @@ class Sweep:
 
 
 def main() -> int:
-    """Run the sweeps; exit 1 unless each is whole."""
+    """Run the sweeps; exit 1 unless each is complete."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--cells", type=int, default=300)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--skip-ray", action="store_true", help="local processes alone")
+    parser.add_argument("--skip-ray", action="store_true", help="use local processes only")
     parser.add_argument(
         "--json", action="store_true", help="accepted for symmetry; the last line is always JSON"
     )

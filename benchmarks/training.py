@@ -1,13 +1,13 @@
 """Measure training from the feature cache.
 
-30 epochs of 5,000 transitions by the recipe `paper`, two views of 2,048.
+30 epochs of 5,000 transitions with recipe `paper`, two views with 2,048 features.
 
     python benchmarks/training.py --json
     python benchmarks/training.py --views 1 --dim 1280
 
-The features are noise in a cache entry of their own (their values make no difference to the time);
-data, split, policy, checkpoint and its training states are those of
-`surgicai_vision.training.train.train`. Prints one JSON line.
+The features are noise in separate cache entries (their values do not affect the time). Data, split,
+policy, checkpoint and its training states are those of `surgicai_vision.training.train.train`.
+Prints one JSON line.
 """
 
 import argparse
@@ -26,11 +26,11 @@ from surgicai_vision.features.cache import encode
 from surgicai_vision.training import policies
 from surgicai_vision.training.train import train
 
-EPISODE = 100  # transitions an episode: the paper's demonstrations of grasp have 94
+EPISODE = 100  # transitions per episode: the paper's demonstrations of grasp have 94
 
 
 class Noise:
-    """A dataset of noise; the frames carry their number alone."""
+    """A dataset of noise; its frames are blank, as only their number matters."""
 
     task = "grasp"
     image_size = 224
@@ -55,7 +55,7 @@ class Noise:
 
 
 def encoder(dim: int) -> Any:
-    """Return an encoder that answers with noise."""
+    """Return an encoder that outputs noise."""
     generator = np.random.default_rng(1)
 
     def answer(frames: np.ndarray) -> np.ndarray:

@@ -1,10 +1,10 @@
-"""Count the needle's pixels at the end of successful expert episodes, view by view.
+"""Count the needle's pixels at the end of successful expert episodes, per view.
 
     python benchmarks/visibility.py --episodes 100
 
-Per task and view: the share of starts at whose successful end the needle covers at least 25 pixels
-of 224 × 224 in the segmentation image (with the exact 95 % interval), and the fewest, the 5 %, and
-the median number of pixels. Starts that the expert fails are counted apart.
+Per task and view: the share of successful episodes at whose end the needle covers at least 25
+pixels of 224 × 224 in the segmentation image (with the exact 95 % interval), and the minimum, the
+5 % quantile and the median of the number of pixels. Starts that the expert fails are left out.
 """
 
 import argparse
@@ -24,7 +24,7 @@ TASKS = ("grasp", "place", "insert", "handoff")
 SIZE = 224
 PIXELS = 25
 GOAL = 0.95
-"""Side of an image, fewest needle pixels in it, share of the starts that must show as many."""
+"""Image side, fewest needle pixels in it, and share of the starts that must show that many."""
 
 
 class Job(NamedTuple):
@@ -36,7 +36,7 @@ class Job(NamedTuple):
 
 
 def count(job: Job) -> list[list[int] | None]:
-    """Return the needle's pixels per view at each episode's end, None where it failed."""
+    """Return the needle's pixels per view at each episode's end, None if it failed."""
     env = envs.make(job.config)
     counts = [_pixels(env, seed, job.views) for seed in job.seeds]
     env.close()
@@ -52,7 +52,7 @@ def _pixels(env: envs.SuturingEnv, seed: int, views: tuple[str, ...]) -> list[in
             _, _, terminated, truncated, info = env.step(expert.action())
             if terminated or truncated:
                 break
-    except SurgicaiError:  # no physical start, or a way that cannot be reached
+    except SurgicaiError:  # no physical start, or an unreachable path
         return None
     if not info["is_success"]:
         return None
@@ -77,7 +77,7 @@ def table(pixels: list[int]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Play, look, and print one JSON line."""
+    """Play, count the pixels, and print one JSON line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

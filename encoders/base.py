@@ -1,29 +1,29 @@
-"""What every encoder is: a frozen network behind one call.
+"""The interface of every encoder: a frozen network behind one call.
 
 Interface:
 
-* `EncoderCard`, `Plugin` (from encoders.card): what a member file offers. `plugin.build(card,
+* `EncoderCard`, `Plugin` (from encoders.card): what a member file provides. `plugin.build(card,
   path)` returns the final card (a variant of the weights may change it) and a `torch.nn.Module` of
   (B, 3, S, S) normalised images → (B, dim).
 * `Encoder(card, network, pool)`: the final class. `encoder(frames (B, H, W, 3) uint8 RGB) -> (B,
-  dim) float32`, frozen for good: eval mode, no gradient, and nothing can put it back into training.
+  dim) float32`, permanently frozen: eval mode, no gradient, and no way back into training mode.
 * `state_sha256(module)`: one hash over all parameters and buffers; `network_sha256(module)`: one
   over its layers and their code.
 * `read_tensors(path)`: safetensors, or a torch file read with `weights_only=True`.
-* `load_exactly(network, tensors, where)`: load; names and shapes must fit to the last.
+* `load_exactly(network, tensors, where)`: load; all names and shapes must match exactly.
 
 The same image gives the same feature, whatever batch it is in, so that a live evaluation sees what
 the cache holds. Measured on a Xeon with AMX (bf16, channels_last): convolutions give the same bits
-for any batch and thread count; transformers and attention pools do not (up to 1 % between batch
+for any batch and thread count. Transformers and attention pools do not (up to 1 % between batch
 sizes, and between one and two threads), but do for a fixed batch on one thread, at any position and
-beside any neighbours. So:
+next to any other images. Therefore:
 
-* every piece holds exactly as many images as the card says (`CUDA_BATCH`). What is left over is
-  padded, unless this network on this machine is found to give the same bits in smaller pieces: then
-  it is cut into those of `SMALL`;
-* on a CPU each piece is computed by one thread, and pieces run side by side, one per core. That is
-  also faster where others use the cores: 4 to 5 times at a load of 5 on 2 cores, ResNet-50 and
-  EfficientNet;
+* every piece holds exactly as many images as the card says (on a GPU, `CUDA_BATCH`). The remainder
+  is padded, unless this network on this machine is found to give the same bits in smaller pieces:
+  then it is cut into pieces of the sizes in `SMALL`;
+* on a CPU each piece is computed by one thread, and pieces run in parallel, one per core. That is
+  also faster when other processes use the cores: 4 to 5 times at a load of 5 on 2 cores, for
+  ResNet-50 and EfficientNet;
 * features are rounded to the values float16 can hold.
 
 BatchNorms are folded into the convolutions before them (`encoders.fold_batchnorm`).
@@ -68,9 +68,9 @@ LIBRARIES = ("torch", "torchvision", "open_clip", "timm")
 """Packages whose classes are known by their names: the lock file pins what they compute."""
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 """Where in memory a function is that a layer prints; another in every process."""
-SMALL = (4, 2, 1)  # smaller pieces that are tried; each costs as much an image as a whole one
+SMALL = (4, 2, 1)  # smaller pieces that are tried; each costs as much per image as a whole one
 PROBE_SEED = 0
-FINGERPRINT_VERSION = 3  # raise when the same weights and card begin to give other features
+FINGERPRINT_VERSION = 3  # increase when the same weights and card begin to give other features
 
 
 class MapNetwork(nn.Sequential):
@@ -135,7 +135,7 @@ def network_sha256(network: nn.Module) -> str:
     classes = {type(part) for part in network.modules()}
     for kind in sorted(classes, key=lambda kind: (kind.__module__, kind.__qualname__)):
         if kind.__module__.partition(".")[0] not in LIBRARIES:
-            with contextlib.suppress(OSError, TypeError):  # made where there is no file, a prompt
+            with contextlib.suppress(OSError, TypeError):  # defined without a file, at a prompt
                 total.update(inspect.getsource(kind).encode())
     return total.hexdigest()
 

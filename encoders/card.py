@@ -1,4 +1,4 @@
-"""An encoder's card, and what a member file offers.
+"""An encoder's card, and the plug-in that a member file provides.
 
 Both are plain data, so that listing encoders loads no torch.
 """

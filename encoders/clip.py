@@ -74,7 +74,7 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     }
     name = card.architecture.removeprefix("open_clip ").partition(",")[0]
     level = logging.root.level
-    logging.root.setLevel(logging.ERROR)  # open_clip warns that it loads nothing; we do
+    logging.root.setLevel(logging.ERROR)  # open_clip warns that it loads no weights; we load them
     try:
         with torch.random.fork_rng(devices=[]):
             network = open_clip.create_model(name, load_weights=False, force_quick_gelu=True).visual

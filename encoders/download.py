@@ -1,8 +1,8 @@
-"""Download one weights file: resumed where it broke off, taken only when its hash is right.
+"""Download one weights file: resumable, and accepted only if its hash is right.
 
-`fetch(source, revision, filename, sha256, folder) -> Path`. The hub's own client starts a file anew
-after a killed process, so the bytes are fetched here: into `<filename>.<identity>.partial`, by HTTP
-ranges, renamed when whole.
+`fetch(source, revision, filename, sha256, folder) -> Path`. The hub's own client restarts a file
+from scratch after a killed process. The bytes are therefore fetched here by HTTP ranges, into
+`<filename>.<identity>.partial`, which is renamed when complete.
 """
 
 import os
@@ -76,7 +76,7 @@ def _complete(url: str, file: BinaryIO, size: int | None, name: str) -> None:
             problem = "the server closed the connection"
             try:
                 _append(url, file, show)
-            except Exception as error:  # whatever the network did: what has come is kept
+            except Exception as error:  # whatever the network did: the bytes received are kept
                 problem = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
             if size is None and problem.startswith("the server"):
                 return

@@ -1,11 +1,11 @@
-"""Fold each BatchNorm into the convolution before it, once the weights stand.
+"""Fold each BatchNorm into the convolution before it, once the weights are loaded.
 
-    folded = fold_batch_norms(network, 224)    # answers as the network does, up to rounding
+    folded = fold_batch_norms(network, 224)    # same output as the network, up to rounding
 
-A frozen BatchNorm is one scale and one shift a channel, which the convolution's own weights can
-hold. Left as a layer of its own it is one more pass over the whole map: an image takes 33 and not
-24 ms (ResNet-50), 13 and not 10 (EfficientNet-Lite0; one thread of a Xeon with AMX, bfloat16).
-`benchmarks/encode.py` compares with networks as they are published.
+A frozen BatchNorm is one scale and one shift per channel, which the convolution's own weights can
+absorb. As a separate layer it costs one more pass over the whole map: an image takes 33 instead of
+24 ms (ResNet-50), 13 instead of 10 (EfficientNet-Lite0; one thread of a Xeon with AMX, bfloat16).
+`benchmarks/encode.py` compares with networks as published.
 """
 
 import copy
@@ -32,7 +32,7 @@ def fold_batch_norms(network: nn.Module, side: int) -> nn.Module:
         side: height and width of the images (B, 3, side, side) it takes.
     """
     if not any(isinstance(part, nn.BatchNorm2d) for part in network.modules()):
-        return network  # a transformer: neither copied nor asked
+        return network  # a transformer: neither copied nor compared
     folded = copy.deepcopy(network)
     _fold(folded)
     images = torch.randn(1, 3, side, side, generator=torch.Generator().manual_seed(SEED))

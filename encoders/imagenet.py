@@ -1,8 +1,8 @@
-"""`imagenet`: ResNet-50 supervised on ImageNet-1k; the variant is known by its file's hash.
+"""`imagenet`: ResNet-50 supervised on ImageNet-1k; the variant is identified by its file's hash.
 
-The paper's code took torchvision's first weights (V1), which timm hosts as `resnet50.tv_in1k`.
-Other files of the same names and shapes differ in ways that fail silently: `VARIANTS` says for each
-known file what it is, where its stride stands and what its statistics are.
+The paper's code used torchvision's first weights (V1), which timm hosts as `resnet50.tv_in1k`.
+Other files with the same names and shapes differ in ways that fail silently: `VARIANTS` says for
+each known file what it is, where its stride is and what its statistics are.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from surgicai_vision.core.files import sha256_file
 if TYPE_CHECKING:
     from torch import nn
 
-MEAN = (0.485, 0.456, 0.406)  # of torchvision's own training, as is the next
+MEAN = (0.485, 0.456, 0.406)  # of torchvision's own training, like the next
 STD = (0.229, 0.224, 0.225)
 
 CARD = EncoderCard(

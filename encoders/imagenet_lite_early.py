@@ -1,8 +1,8 @@
 """`imagenet-lite-early`: the first three stages of `imagenet-lite`, for `--pool spatial`.
 
-A map of 28 × 28 places still says where a thin needle lies, which the last layer's 7 × 7 and a
-global feature lose (docs/results/scene-0.1.md compares), at a third of the whole network's
-arithmetic.
+A map of 28 × 28 places still shows where a thin needle lies, at a third of the whole network's
+arithmetic. The last layer's 7 × 7 map and a global feature lose that (compared in
+docs/results/scene-0.1.md).
 """
 
 import functools

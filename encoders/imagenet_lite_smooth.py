@@ -1,8 +1,8 @@
 """`imagenet-lite-smooth`: `imagenet-lite-early` behind a Gaussian, for noisy cameras.
 
-The first convolutions of a network answer to edges, and take a camera's pixel noise for them. The
-Gaussian of 1.5 px divides the noise's standard deviation by five (2 √π · 1.5) and leaves a needle,
-which is about five pixels thick in a crop, its edges. docs/results/unmoved.md says what that gives.
+The first convolutions of a network respond to edges, and mistake a camera's pixel noise for them.
+The Gaussian of 1.5 px divides the noise's standard deviation by five (2 √π · 1.5) but keeps the
+edges of a needle, which is about five pixels thick in a crop. docs/results/unmoved.md has results.
 """
 
 from dataclasses import replace

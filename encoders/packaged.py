@@ -1,9 +1,9 @@
 """EfficientNet-Lite0 whose weights are installed by pip.
 
 `imagenet-lite`, `imagenet-lite-early` and `imagenet-lite-smooth` share it. The package ships one
-torch file whose tensors stand in the same order, with the same shapes, as those of timm's
-`tf_efficientnet_lite0`; only the names differ, so they are mapped by position. Checked by
-classification in the tests of encoders.
+torch file whose tensors have the same order and shapes as those of timm's `tf_efficientnet_lite0`.
+Only the names differ, so they are mapped by position. The tests of encoders check this by
+classification.
 """
 
 import importlib.util

@@ -1,7 +1,7 @@
-"""`r3m`: ResNets trained on Ego4D by time contrast and language (Nair et al., CoRL 2022).
+"""`r3m`: ResNets trained on Ego4D with time contrast and language (Nair et al., CoRL 2022).
 
 R3M takes images in 0–255, divides by 255 and normalises with ImageNet's statistics itself; the card
-writes that as a mean and a standard deviation in units of 0–255.
+expresses this as a mean and a standard deviation in units of 0–255.
 """
 
 from dataclasses import replace

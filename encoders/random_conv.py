@@ -1,8 +1,8 @@
 """`random-conv`: four convolutions that were never trained, for `--pool spatial`.
 
-A map of 28 × 28 places keeps where things are, which a global feature loses, at a fiftieth of a
-ResNet-50's arithmetic. Random filters followed by a trained choice among their answers are an old
-and strong baseline where images come from one scene (Jarrett et al., What is the best multi-stage
+A map of 28 × 28 places preserves where things are, which a global feature loses, at a fiftieth of a
+ResNet-50's arithmetic. Random filters followed by a trained selection of their responses are an old
+and strong baseline for images from one scene (Jarrett et al., What is the best multi-stage
 architecture for object recognition?, 2009).
 """
 

@@ -1,4 +1,4 @@
-"""Weights files: read without running code in them, and loaded to the last tensor.
+"""Weights files: read without running code in them, and loaded in full.
 
 Imports no torch before a file is read, so that a card can be looked up at once.
 """

@@ -1,4 +1,4 @@
-"""`dinov2`, `siglip2` and `timm:<name>`: any network of timm with its own weights and statistics.
+"""`dinov2`, `siglip2` and `timm:<name>`: any timm network with its own weights and statistics.
 
 `timm:<name>` takes the card from timm's own table, the licence included; the feature is timm's
 pooled output without a classifier.
@@ -61,8 +61,8 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     if path is None:
         raise BadFile(f"Encoder '{card.name}' needs a weights file.")
     name = card.architecture.removeprefix("timm ")
-    # Networks with position embeddings, and only they, take an image size other than that of their
-    # training as an argument.
+    # Only networks with position embeddings take, as an argument, an image size other than that of
+    # their training.
     resized = {} if card.input_size == _trained_size(name) else {"img_size": card.input_size}
     with torch.random.fork_rng(devices=[]):
         try:

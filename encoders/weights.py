@@ -3,10 +3,10 @@
 Interface:
 
 * `find(card, weights, accept_licence) -> Path | None`: in this order: the file given, the folder of
-  `SURGICAI_VISION_WEIGHTS`, the hub's cache, a download into our own cache (resumed where one was
-  broken off). Whatever was not handed over by name is checked against the card's hash; a card
-  without one ("unpinned") takes the hash the hub itself gives. Without a network it raises
-  `MissingWeights` within seconds.
+  `SURGICAI_VISION_WEIGHTS`, the hub's cache, a download into our own cache (resumed if cut off).
+  Any file that was not given by name is checked against the card's hash; for a card without one
+  ("unpinned"), the hash reported by the hub is used. Without a network it raises `MissingWeights`
+  within seconds.
 
 In the folder of `SURGICAI_VISION_WEIGHTS` a file is looked for as `<encoder>/<filename>`,
 `<encoder>.<suffix>` and `<filename>`.
@@ -25,7 +25,7 @@ from surgicai_vision.core.files import cache_root, sha256_file
 
 FOLDER_VARIABLE = "SURGICAI_VISION_WEIGHTS"
 NON_COMMERCIAL = "-NC"
-PROBE_SECONDS = 2.0  # the hub client alone would retry for half a minute without a network
+PROBE_SECONDS = 2.0  # without a network the hub's own client would retry for half a minute
 
 
 def find(

@@ -2,7 +2,7 @@
 
 python examples/compare_policies.py expert random --task grasp --episodes 20
 
-A policy is a checkpoint folder, a hierarchical.yaml, module:factory, or a baseline's name.
+A policy is a checkpoint folder, a hierarchical.yaml, module:factory, or the name of a baseline.
 """
 
 import argparse
@@ -20,11 +20,11 @@ def main() -> None:
     """Evaluate every policy on the same starts and test every pair."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("policies", nargs="*", default=["expert", "random"])
-    parser.add_argument("--task", help="default: the checkpoint's, else grasp")
+    parser.add_argument("--task", help="task to evaluate; default: the checkpoint's, or grasp")
     parser.add_argument("--episodes", type=int, default=20)
     arguments = parser.parse_args()
 
-    # One seed is one start, so row i of every policy began in the same state.
+    # Each seed is one start, so row i of every policy began in the same state.
     starts = range(TEST_SEED, TEST_SEED + arguments.episodes)
     successes = {}
     for given in arguments.policies:
@@ -38,7 +38,8 @@ def main() -> None:
             f"kinds of failure: {failures}"
         )
 
-    # Only starts that one of two policies solves say which is better; chance splits them evenly.
+    # Only starts that exactly one of two policies solves show which is better; chance would split
+    # them evenly.
     pairs = list(itertools.combinations(successes, 2))
     p_values = [mcnemar(successes[one], successes[other]) for one, other in pairs]
     for (one, other), p in zip(pairs, holm(p_values), strict=True):  # many tests, one error rate
@@ -47,5 +48,5 @@ def main() -> None:
         print(f"{one} against {other}: {only_one} : {only_other} starts, p = {p:.2g} (Holm)")
 
 
-if __name__ == "__main__":  # workers are spawned: they import this file
+if __name__ == "__main__":  # spawned workers import this file
     main()

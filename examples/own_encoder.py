@@ -1,4 +1,4 @@
-"""An encoder of your own, used like the ones that are there: a 16 × 16 thumbnail.
+"""Your own encoder, used like the built-in ones: a 16 × 16 thumbnail.
 
 python examples/own_encoder.py --demonstrations 20 --episodes 10
 """
@@ -21,7 +21,7 @@ from surgicai_vision.experiments.prepare import prepare_dataset
 from surgicai_vision.experiments.run import train_run
 from surgicai_vision.training.run_config import RunConfig, with_epochs
 
-CARD = EncoderCard(  # where the encoder comes from, and what it wants to see
+CARD = EncoderCard(  # where the encoder comes from, and which input it expects
     name="thumbnail", architecture="mean over 16 × 16 squares", dim=3 * 16 * 16, paper="none",
     source="seed", revision="1", filename=None, sha256=None, licence="MIT", offline=True,
     input_size=224, input_range=(0.0, 1.0), mean=(0.5, 0.5, 0.5), std=(0.25, 0.25, 0.25),
@@ -34,15 +34,15 @@ def build(card: EncoderCard, weights: Path | None) -> tuple[EncoderCard, nn.Modu
     return card, nn.Sequential(nn.AvgPool2d(224 // 16), nn.Flatten())
 
 
-# At the top of the file: worker processes import it, and then know the encoder too.
+# At the top level, so that worker processes, which import this file, know the encoder too.
 surgicai_vision.register_encoder("thumbnail", Plugin(CARD, build))
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--demonstrations", type=int, default=20)
-    parser.add_argument("--epochs", type=int, help="default: the recipe's")
+    parser.add_argument("--epochs", type=int, help="training epochs; default: the recipe's")
     parser.add_argument("--episodes", type=int, default=10)
-    parser.add_argument("--workers", type=int, help="processes; default: one a core")
+    parser.add_argument("--workers", type=int, help="processes; default: one per core")
     arguments = parser.parse_args()
     out, context = Path("outputs/own_encoder"), RunContext(arguments.workers)
     count, changes = arguments.demonstrations, with_epochs((), arguments.epochs)

@@ -17,18 +17,18 @@ from surgicai_vision.demos.rollout import Disturbance
 
 
 def main() -> None:
-    """Do all of it in one folder; what is there already is not done again."""
+    """Do all of it in one folder; steps that are already done are skipped."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="insert")
     parser.add_argument("--episodes", type=int, default=5)
     parser.add_argument("--size", type=int, default=224, help="side of an image [px]")
-    parser.add_argument("--workers", type=int, help="processes; default: one a core")
+    parser.add_argument("--workers", type=int, help="processes; default: one per core")
     arguments = parser.parse_args()
     out = Path("outputs/record_and_render")
-    context = RunContext(arguments.workers)  # the result does not depend on how many
+    context = RunContext(arguments.workers)  # the result does not depend on their number
 
-    # A demonstration is states and actions, no images. The noise shows how to recover (DART):
-    # the executed actions are disturbed, the recorded labels are the expert's own.
+    # A demonstration consists of states and actions, without images. Noise makes it show how to
+    # recover (DART): the executed actions are disturbed, the recorded labels are the expert's own.
     demos = out / "demos"
     record(
         TaskConfig(arguments.task),
@@ -38,8 +38,8 @@ def main() -> None:
         context=context,
     )
 
-    # The same demonstrations in two looks: two views with depth, and every fifth frame of a crop
-    # that follows the arm. Both are LeRobot v3 datasets.
+    # The same demonstrations, rendered twice: two views with depth, and every fifth frame of a
+    # crop that follows the arm. Both are LeRobot v3 datasets.
     both, few = out / "two_views", out / "every_fifth"
     shared = {"size": arguments.size, "context": context}
     render_demos(demos, both, views=("front", "back"), depth=True, **shared)
@@ -56,5 +56,5 @@ def main() -> None:
         print(f"  a film strip of the first episode: {folder.with_suffix('.png')}")
 
 
-if __name__ == "__main__":  # workers are spawned: they import this file
+if __name__ == "__main__":  # spawned workers import this file
     main()

@@ -1,4 +1,4 @@
-"""From demonstrations to a counted success rate, without the command line.
+"""From demonstrations to a measured success rate, without the command line.
 
 python examples/train_in_python.py --task place --demonstrations 50 --episodes 20
 """
@@ -19,14 +19,14 @@ from surgicai_vision.training.run_config import RunConfig, with_epochs
 
 
 def main() -> None:
-    """Do all of it in one folder; what is there already is not done again."""
+    """Do all of it in one folder; steps that are already done are skipped."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="place")
     parser.add_argument("--demonstrations", type=int, default=50)
     parser.add_argument("--encoder", default="imagenet-lite")
-    parser.add_argument("--epochs", type=int, help="default: the recipe's")
+    parser.add_argument("--epochs", type=int, help="training epochs; default: the recipe's")
     parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--workers", type=int, help="processes; default: one a core")
+    parser.add_argument("--workers", type=int, help="processes; default: one per core")
     arguments = parser.parse_args()
 
     out = Path("outputs/train_in_python")
@@ -40,21 +40,21 @@ def main() -> None:
         depth=False,
     )
 
-    # A run is data. These two differ in one thing: whether the policy sees.
+    # A run is plain data. These two differ only in whether the policy sees images.
     changes = with_epochs((), arguments.epochs)
     dataset = open_dataset(folder)
     sees = RunConfig(dataset.config, arguments.encoder, ("front",), changes=changes)
     blind = RunConfig(dataset.config, changes=changes)
 
-    # Held-out starts: training draws its seeds elsewhere, so they never meet.
+    # Held-out starts: training draws its seeds from another range, so they never overlap.
     starts = range(TEST_SEED, TEST_SEED + arguments.episodes)
     for run in (sees, blind):
         checkpoint = out / "policies" / run.name
-        train_run(run, dataset, checkpoint, silent_stage)  # features first, from the cache
+        train_run(run, dataset, checkpoint, silent_stage)  # encodes first, or uses the cache
         result = evaluate_into(out / "evaluations" / run.name, open_policy(checkpoint), starts)
         low, high = result["ci95"]
         print(f"{run.name}: {result['successes']}/{result['episodes']} ({low:.2f}–{high:.2f})")
 
 
-if __name__ == "__main__":  # workers are spawned: they import this file
+if __name__ == "__main__":  # spawned workers import this file
     main()

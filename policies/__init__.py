@@ -1,5 +1,5 @@
-"""Policies: the family you extend to act differently, one file a member.
+"""Policies: the plug-in family to extend with new ways of acting, one file per member.
 
-A member is a `policies.base.Plugin` (a recipe type and a policy type) and one line in
+A member is a `policies.base.Plugin` (a recipe type and a policy type) plus one line in
 `surgicai_vision.training.policies`.
 """

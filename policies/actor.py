@@ -1,15 +1,15 @@
-"""`actor`: what reinforcement and offline learning leave behind: the actor, without its critics.
+"""`actor`: the actor that reinforcement or offline learning produces, without its critics.
 
-An MLP with ReLU between its layers on a state with the goal: the relative features of the env
-(`surgicai_vision.envs.relative`) or the 21 values of obs_type "state"; the mean action, squashed by
-a tanh or clipped. The algorithm and its settings stand in the recipe as data, so that a checkpoint
-says how it was trained. `surgicai-vision train --algo` makes them; as a policy of `train --policy`
-it is cloned from the 21 values of a dataset.
+An MLP with ReLU between its layers. Its input is a state with the goal: the relative features of
+the env (`surgicai_vision.envs.relative`) or the 21 values of obs_type "state". Its output is the
+mean action, squashed by a tanh or clipped. The recipe holds the algorithm and its settings as data,
+so that a checkpoint records how it was trained. `surgicai-vision train --algo` trains actors; with
+`train --policy` an actor is cloned from the 21 values of a dataset.
 
 `bcq` is the policy of batch-constrained Q-learning (Fujimoto et al., ICML 2019, arXiv:1812.02900):
-a decoder draws actions as the demonstrations have them, a second network shifts each a little, and
-the critic says which is taken. The draws are made once and stored with the weights, so that it too
-is a function of what it sees.
+a decoder samples actions like those of the demonstrations, a second network shifts each slightly,
+and the critic chooses one. The latent samples are drawn once and stored with the weights, so that
+this policy, too, is a deterministic function of its input.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError, check_name
 
 VECTORS = {"relative": names.RELATIVE_STATE, "state": names.PRIVILEGED_STATE}
-"""`ActorRecipe.observation` → what it is fed."""
+"""`ActorRecipe.observation` → key of the actor's input."""
 SQUASHES = ("tanh", "clip")
 
 
@@ -39,7 +39,7 @@ class ActorRecipe(Recipe):
         observation: "relative" or "state".
         squash: how a mean becomes an action: "tanh", or "clip" (PPO's Gaussian).
         algo: the algorithm that trained it; "" where it was cloned from a dataset.
-        settings: what the algorithm was run with, as data.
+        settings: the algorithm's settings, as data.
     """
 
     batch_norm: bool = False
@@ -75,15 +75,15 @@ class Actor(Policy):
 
     @torch.no_grad()
     def take(self, layers: Sequence[nn.Linear], mean: torch.Tensor, std: torch.Tensor) -> None:
-        """Take the weights of a library's actor.
+        """Copy the weights of a library's actor.
 
         Args:
-            layers: its linear layers, in order; ReLU stands between them.
-            mean: what is removed from each input, (inputs.dim,).
-            std: what each is then divided by.
+            layers: its linear layers, in order, with ReLU between them.
+            mean: mean subtracted from each input, (inputs.dim,).
+            std: standard deviation each is then divided by.
 
         Raises:
-            InputError: another number of layers, or layers of another size.
+            InputError: the number or the sizes of the layers differ.
         """
         _copy([layer for layer in self.network.layers if isinstance(layer, nn.Linear)], layers)
         self.input_mean.copy_(mean)
@@ -91,18 +91,18 @@ class Actor(Policy):
 
 
 DRAWS = 100
-"""Actions that `bcq` chooses from (the paper)."""
+"""Number of actions that `bcq` chooses from (as in the paper)."""
 LATENT = 2 * ACTIONS
-"""Size of a draw (the authors' code, and d3rlpy)."""
+"""Length of a latent sample (as in the authors' code and in d3rlpy)."""
 LATENT_LIMIT = 0.5
-"""Draws are clipped to ± this (the same)."""
+"""Latent samples are clipped to ± this (same sources)."""
 FLEXIBILITY = 0.05
-"""Largest shift of a drawn action (the paper's Φ)."""
+"""Largest shift of a sampled action (the paper's Φ)."""
 
 
 @final
 class BatchConstrained(Policy):
-    """The policy of BCQ: decoder, shift, critic and the draws."""
+    """The policy of BCQ: decoder, shift network, critic and stored latent samples."""
 
     draws: torch.Tensor
 
@@ -136,12 +136,12 @@ class BatchConstrained(Policy):
     def take(
         self, layers: Sequence[Sequence[nn.Linear]], mean: torch.Tensor, std: torch.Tensor
     ) -> None:
-        """Take the weights of a library's decoder, shift and critic, and make the draws.
+        """Copy the weights of a library's decoder, shift network and critic; draw the samples.
 
         Args:
             layers: the linear layers of each, in order.
-            mean: what is removed from each input, (inputs.dim,).
-            std: what each is then divided by.
+            mean: mean subtracted from each input, (inputs.dim,).
+            std: standard deviation each is then divided by.
         """
         for own, given in zip((self.decoder, self.shift, self.critic), layers, strict=True):
             _copy([layer for layer in own if isinstance(layer, nn.Linear)], given)
@@ -165,7 +165,7 @@ def _copy(own: Sequence[nn.Linear], given: Sequence[nn.Linear]) -> None:
     """Copy weights layer by layer.
 
     Raises:
-        InputError: another number of layers, or layers of another size.
+        InputError: the number or the sizes of the layers differ.
     """
     sizes = [tuple(layer.weight.shape) for layer in own]
     others = [tuple(layer.weight.shape) for layer in given]

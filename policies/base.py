@@ -1,15 +1,15 @@
-"""What every policy is: features and proprioception in, an action out.
+"""The interface of every policy: features and proprioception in, an action out.
 
 Interface:
 
 * `Policy`: abstract torch module. `policy.act(features (B, F) float32 | None, agent_pos (B, 7)
   float32) -> (B, 7) float32` for use; `policy.loss(features, agent_pos, action)` for training.
-* `Plugin(name, recipe, make)`: what a member file offers: its frozen recipe type and the function
+* `Plugin(name, recipe, make)`: what a member file provides: its frozen recipe type and the function
   that builds an untrained policy, `make(recipe, visual)`.
-* `Inputs`: what a policy is fed.
+* `Inputs`: the inputs of a policy.
 
-Actions must not depend on how many environments are asked at once: `act` computes in float64 and
-rounds to float32, which hides the order in which a matrix product was summed.
+Actions must not depend on how many envs are in a batch: `act` computes in float64 and rounds to
+float32, which hides the order in which a matrix product was summed.
 """
 
 import abc
@@ -51,13 +51,13 @@ VECTORS: Mapping[str, int] = MappingProxyType(
         names.RELATIVE_STATE: len(names.RELATIVE_NAMES),
     }
 )
-"""What may be fed beside features: key → length."""
+"""Inputs that may be fed alongside the features: key → length."""
 WIDEST = 65_536
-"""Most units of a hidden layer; the policies that come with the product have 256."""
+"""Maximum units of a hidden layer; the bundled policies have 256."""
 MOST_EPOCHS = 1_000_000
-"""Most passes over the training frames."""
+"""Maximum number of passes over the training frames."""
 FARTHEST_SHIFT = 1_024
-"""Farthest a feature map is moved [places]; no map is wider."""
+"""Maximum shift of a feature map [places]; no map is wider."""
 
 
 @dataclass(frozen=True)
@@ -67,35 +67,34 @@ class Recipe:
     Attributes:
         hidden: width of each hidden layer.
         batch_norm: put BatchNorm before each hidden layer.
-        learning_rate: Adam's.
+        learning_rate: Adam's learning rate.
         weight_decay: decoupled weight decay (AdamW) [per step, times the learning rate].
-        schedule: "constant", or "one_cycle": up to the learning rate over the first third, then
-            down to nothing (Smith and Topin, Super-convergence, 2017).
-        epochs: passes over the training frames; the last one is the checkpoint.
+        schedule: "constant", or "one_cycle": up to the learning rate over about the first third,
+            then down to almost zero (Smith and Topin, Super-convergence, 2017).
+        epochs: passes over the training frames; the checkpoint is that of the last one.
         batch_size: frames per step.
         split: "episode", or "transition" as in SurgicAI's released code (neighbouring frames
             leak).
         validation: share of the episodes (or transitions) held out of training.
-        proprioception: feed tip pose and jaw too: the active arm's, for a high-level policy both
-            arms'.
-        setpoint: feed how far the set point lies from the measured pose as well (needs
+        proprioception: also feed tip pose and jaw: of the active arm, or of both arms for a
+            high-level policy.
+        setpoint: also feed the offset of the set point from the measured pose (needs
             proprioception): an action moves the set point, and the tool lags behind it.
-        clock: feed the time since the subtask began as well (needs proprioception), for
-            demonstrators that act by it; its hand must be seen in more than one place
-            (`frame_stride`).
-        progress_input: feed how far the subtask is, as a high-level policy with `progress` says it,
-            in the place of the clock (`train --progress-from`; needs proprioception).
-        map_head: what takes in a feature map: "softmax" (where each of 32 patterns lies) or
+        clock: also feed the time since the subtask began (needs proprioception), for demonstrators
+            whose actions depend on it; the clock is periodic, so `frame_stride` must not give all
+            frames the same phase.
+        progress_input: feed the progress of the subtask, as predicted by a high-level policy with
+            `progress`, instead of the clock (`train --progress-from`; needs proprioception).
+        map_head: head for feature maps: "softmax" (the position of each of 32 patterns) or
             "convolutions".
-        frame_stride: train on each N-th frame of an episode alone, from its first: neighbours show
+        frame_stride: train only on every N-th frame of an episode, from its first: neighbours show
             nearly the same.
-        privileged: feed the 21 values of obs_type "state", goal included, in place of all else:
-            an upper bound.
-        join_views: take in the feature maps of all views as channels of one map, so that
-            convolutions see both eyes at once; else each view has a head of its own.
+        privileged: feed only the 21 values of obs_type "state", goal included: an upper bound.
+        join_views: treat the feature maps of all views as channels of one map, so that
+            convolutions see both eyes at once; otherwise each view has its own head.
         proprioception_noise: noise on the measured poses in training, in standard deviations of
-            each value; 0 is none.
-        map_shift: move feature maps by up to so many places in training; 0 does not.
+            each value; 0 adds none.
+        map_shift: shift feature maps by up to this many places in training; 0 disables shifts.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -167,13 +166,13 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a policy is fed.
+    """The inputs of a policy.
 
     Attributes:
         visual: shape of each view's feature, in the order of the views: (dim,), (C, h, w) or (N,
             C); rows are flattened; empty without images.
-        vector: keys of `VECTORS`, what is fed beside the features, one after the other; empty for
-            the features alone.
+        vector: keys of `VECTORS`: the inputs that follow the features, in this order; empty for
+            features only.
     """
 
     visual: tuple[tuple[int, ...], ...]
@@ -191,17 +190,17 @@ class Inputs:
 
     @property
     def knows_goal(self) -> bool:
-        """Whether it is fed a state with the goal, which no robot tells."""
+        """Whether a state with the goal is fed, which no robot can report."""
         return not set(self.vector).isdisjoint(names.STATES_WITH_GOAL)
 
     @property
     def width(self) -> int:
-        """Length of what is fed beside the features."""
+        """Length of the vector fed alongside the features."""
         return sum(VECTORS[key] for key in self.vector)
 
     @property
     def features(self) -> int:
-        """Length of the views' rows side by side."""
+        """Length of the views' rows, concatenated."""
         return sum(math.prod(shape) for shape in self.visual)
 
     @property
@@ -211,16 +210,16 @@ class Inputs:
 
 
 def visual_shapes(recipe: Recipe, visual: Sequence[tuple[int, ...]]) -> tuple[tuple[int, ...], ...]:
-    """Return the shape of each feature that a head of its own takes in.
+    """Return the shape of each feature that gets its own head.
 
-    Rows of maps lie side by side, channel after channel: joined they are one map already.
+    Rows of maps are concatenated channel by channel, so joined rows already form one map.
 
     Args:
-        recipe: its `join_views` counts.
+        recipe: only its `join_views` is used.
         visual: shape of each view's feature.
 
     Raises:
-        InputError: views are to be joined whose features are not maps of one size.
+        InputError: views are to be joined, but their features are not maps of one size.
     """
     if not recipe.join_views or len(visual) < 2:
         return tuple(visual)
@@ -233,7 +232,7 @@ def visual_shapes(recipe: Recipe, visual: Sequence[tuple[int, ...]]) -> tuple[tu
 
 
 def fed_vector(recipe: Recipe) -> tuple[str, ...]:
-    """Return what a recipe feeds beside the features, keys of `VECTORS`."""
+    """Return the keys of `VECTORS` that a recipe feeds alongside the features."""
     if recipe.privileged:
         return (names.PRIVILEGED_STATE,)
     fed = {
@@ -250,12 +249,12 @@ class Plugin:
     """A member of the family.
 
     Attributes:
-        name: the name users give.
+        name: the name by which users select it.
         recipe: frozen dataclass of its settings.
         make: (recipe, shape of each view's feature) → untrained policy.
-        target: what it learns: a dataset's column, or one that is computed of columns:
+        target: what it learns: a dataset's column, or one computed from columns:
             `names.STAGE`, `names.ACTION_CHUNK`.
-        offsets: recipe → which actions a chunk holds, in control steps from the present one; None
+        offsets: recipe → offsets of a chunk's actions, in control steps from the present one; None
             for a policy that learns no chunks.
     """
 
@@ -270,14 +269,14 @@ class Policy(nn.Module, abc.ABC):
     """Base of all policies: holds the statistics of its inputs and normalises them itself.
 
     Attributes:
-        inputs: what it is fed.
+        inputs: its inputs.
         input_mean: mean of each input over the training frames, (inputs.dim,).
         input_std: standard deviation of each, 1 where an input is constant.
-        checkpoint: what a policy that was loaded was restored from.
-        history: observations that it sees, the present one last.
-        averaging: largest decay of the moving average of its weights in training, which is what
-            is kept; 0 keeps the weights themselves.
-        clip: largest norm of a gradient in training; 0 clips none.
+        checkpoint: the checkpoint that a loaded policy was restored from.
+        history: number of observations it sees, the present one last.
+        averaging: largest decay of the moving average of its weights in training; the average is
+            what is kept. 0 keeps the weights themselves.
+        clip: gradient norm limit in training; 0 disables clipping.
     """
 
     history: int = 1
@@ -303,23 +302,23 @@ class Policy(nn.Module, abc.ABC):
         """Return the loss (scalar) for normalised inputs and demonstrated answers (B, …)."""
 
     def measure(self, target: torch.Tensor) -> None:
-        """Fit before the first epoch what gradients of the loss do not; nothing by default.
+        """Fit, before the first epoch, what gradients do not; does nothing by default.
 
         Args:
-            target: what is demonstrated in the training frames, (N, …).
+            target: the demonstrated answers in the training frames, (N, …).
         """
 
     def calibrate(self, answers: torch.Tensor, target: torch.Tensor) -> None:
-        """Fit after the last epoch what gradients do not; nothing by default.
+        """Fit, after the last epoch, what gradients do not; does nothing by default.
 
         Args:
             answers: what `forward` returns for the frames held out, (N, n); N at least 1.
-            target: what was demonstrated there, (N, …).
+            target: the demonstrated answers there, (N, …).
         """
 
     @final
     def normalise(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return raw inputs (B, inputs.dim) with the training frames' mean and variance removed."""
+        """Return raw inputs (B, inputs.dim) standardised by the training frames' statistics."""
         return (observed - self.input_mean).div_(self.input_std)
 
     @final
@@ -329,17 +328,17 @@ class Policy(nn.Module, abc.ABC):
         """Return the answers to a batch of observations.
 
         Args:
-            features: (B, `inputs.features`) float32, the views' rows side by side; None without
+            features: (B, `inputs.features`) float32, the views' rows, concatenated; None without
                 views.
             agent_pos: (B, 7) float32, x y z [m] roll pitch yaw [rad] jaw [rad] of the active tip in
-                its base; the vector of `inputs.vector` where that is another.
+                its base; or the vector that `inputs.vector` names, if it differs.
 
         Returns:
-            (B, 7) float32 in [-1, 1]; of a high-level policy (B, 5) logits, or (B, 6) with the
+            (B, 7) float32 in [-1, 1]; for a high-level policy (B, 5) logits, or (B, 6) with the
             progress last.
 
         Raises:
-            InputError: arrays of other shapes than the policy was trained on, or not finite.
+            InputError: the shapes differ from those trained on, or a value is not finite.
         """
         observed = self.observed(features, agent_pos)
         exact = self._exact
@@ -352,12 +351,12 @@ class Policy(nn.Module, abc.ABC):
         return np.asarray(answers.float().numpy(), np.float32)
 
     def _copy_to_act(self) -> "Policy":
-        """Return the copy that acts, on the CPU."""
+        """Return the copy used to act, on the CPU."""
         return copy.deepcopy(self).cpu().double()
 
     @final
     def train(self, mode: bool = True) -> "Policy":
-        """Switch to training or evaluation; the copy that acts is made again later."""
+        """Switch to training or evaluation mode; `act` then makes a new copy."""
         object.__setattr__(self, "_exact", None)
         super().train(mode)
         return self
@@ -365,7 +364,7 @@ class Policy(nn.Module, abc.ABC):
     def observed(
         self, features: NDArray[np.float32] | None, agent_pos: NDArray[np.float32]
     ) -> NDArray[np.float64]:
-        """Return checked inputs side by side, (B, inputs.dim) float64; see `act`."""
+        """Return the checked inputs, concatenated, (B, inputs.dim) float64; see `act`."""
         agent_pos = np.asarray(agent_pos)
         parts = [] if features is None else [np.asarray(features)]
         width = parts[0].shape[1:] if parts else (0,)

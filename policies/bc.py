@@ -2,7 +2,7 @@
 
 The recipe `paper` (paper, Section 4 and appendix): an MLP of three hidden layers of 256, each
 preceded by BatchNorm, ReLU between, Tanh at the end; mean squared error; Adam, 1e-3, 30 epochs,
-batches of 256; visual features beside the active arm's tip pose and jaw; training and validation
+batches of 256; visual features with the active arm's tip pose and jaw; training and validation
 split by episode.
 """
 

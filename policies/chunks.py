@@ -1,21 +1,21 @@
-"""Policies that plan several actions at a time: what they share.
+"""The common base of policies that plan several actions at a time.
 
 A chunk is what `plan` returns: the actions of the present and the next `chunk - 1` control steps.
-The first `execute` of them are executed, then the policy plans anew; with `ensemble` every action
-is the weighted mean of all chunks that hold one for its step (Zhao et al., Learning fine-grained
+The first `execute` of them are executed, then the policy plans again. With `ensemble` every action
+is the weighted mean over all chunks that contain its step (Zhao et al., Learning fine-grained
 bimanual manipulation with low-cost hardware, RSS 2023, Algorithm 2).
 
 Interface:
 
-* `ChunkRecipe`: a recipe, and how far is planned.
+* `ChunkRecipe`: a recipe with the planning horizon.
 * `ChunkPolicy`: abstract. `policy.plan(features (B, h, F) | None, vectors (B, h, n), seed)` →
   (B, chunk, 7) in [-1, 1], for observations of `history` moments h, the present one last.
-* A member implements `plan_normalised` and `chunk_loss`; actions come to it normalised over the
-  training frames, as LeRobot's normalisers do: "mean_std" or "min_max" (to [-1, 1]).
+* A member implements `plan_normalised` and `chunk_loss`. It gets actions normalised over the
+  training frames in the way of LeRobot's normalisers: "mean_std" or "min_max" (to [-1, 1]).
 
-The chunk's column is made by `surgicai_vision.training.chunks`; it is acted by
-`surgicai_vision.evaluation.chunk_agent`. Members: the distribution `lerobot_env_surgicai` offers
-LeRobot's `act`, `diffusion` and `vqbet`.
+`surgicai_vision.training.chunks` builds the column of chunks;
+`surgicai_vision.evaluation.chunk_agent` executes chunks. Members: LeRobot's `act`, `diffusion` and
+`vqbet`, from the distribution `lerobot_env_surgicai`.
 """
 
 import abc
@@ -34,9 +34,9 @@ from surgicai_vision.core.errors import InputError, check_at_least, check_at_mos
 
 NORMALISATIONS = ("mean_std", "min_max")
 MOST_PLANNED = 1_000
-"""Most actions of a chunk, moments of a history and chunks that are drawn: a whole procedure."""
+"""Maximum actions of a chunk, moments of a history and samples per plan: a whole procedure."""
 SMALLEST_RANGE = 1e-6
-"""An action that varies less is constant, and only its offset is removed."""
+"""An action that varies less counts as constant, and only its offset is removed."""
 
 
 @dataclass(frozen=True)
@@ -44,17 +44,17 @@ class ChunkRecipe(Recipe):
     """Settings of a policy that plans chunks.
 
     Attributes:
-        chunk: actions that are planned at a time [control steps].
+        chunk: actions planned at a time [control steps].
         execute: how many of them are executed before the next plan.
-        history: observations that are seen, the present one last, `frame_stride` control steps
+        history: number of observations seen, the present one last, `frame_stride` control steps
             apart.
-        samples: chunks that a policy which samples draws for a plan; their mean is executed.
-        ensemble: average overlapping chunks by the weights exp(-ensemble · i), i = 0 for the
-            oldest; None executes the newest alone.
+        samples: chunks that a sampling policy draws per plan; their mean is executed.
+        ensemble: average overlapping chunks with the weights exp(-ensemble · i), i = 0 for the
+            oldest; None executes only the newest.
         ema: largest decay of the moving average of the weights; 0 keeps the last weights.
-        clip_gradient: largest norm of a gradient; 0 clips none.
-        minutes: train for as many epochs as fit into so many minutes of one core, in the place of
-            `epochs`; 0 for `epochs`.
+        clip_gradient: gradient norm limit; 0 disables clipping.
+        minutes: train for as many epochs as fit into this many minutes of one core, instead of
+            `epochs`; 0 uses `epochs`.
         settings: fields of the network's own configuration.
     """
 
@@ -96,7 +96,7 @@ class ChunkPolicy(Policy, abc.ABC):
     Attributes:
         chunk, execute, samples, ensemble: as in the recipe.
         spacing: control steps from one observation of the history to the next.
-        heads: what takes in the features.
+        heads: the heads for the features.
     """
 
     action_centre: torch.Tensor
@@ -122,11 +122,11 @@ class ChunkPolicy(Policy, abc.ABC):
 
     @abc.abstractmethod
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-        """Return normalised actions (B, at least chunk, 7), the present step's first.
+        """Return normalised actions (B, at least chunk, 7), from the present step on.
 
         Args:
-            visual: what the heads leave, (B, history, heads.dim).
-            vector: what is fed beside the features, normalised, (B, history, n).
+            visual: output of the heads, (B, history, heads.dim).
+            vector: the inputs other than features, normalised, (B, history, n).
         """
 
     @abc.abstractmethod
@@ -141,8 +141,8 @@ class ChunkPolicy(Policy, abc.ABC):
 
         Args:
             visual, vector: as in `plan_normalised`.
-            actions: demonstrated and normalised, (B, T, 7), of the plug-in's `offsets`.
-            is_pad: (B, T) bool: where the demonstration holds no such step.
+            actions: demonstrated and normalised, (B, T, 7), at the plug-in's `offsets`.
+            is_pad: (B, T) bool: where the demonstration has no such step.
         """
 
     def measure(self, target: torch.Tensor) -> None:
@@ -183,14 +183,14 @@ class ChunkPolicy(Policy, abc.ABC):
 
         Args:
             features: (B, history, `inputs.features`); None without views.
-            vectors: (B, history, n), what `inputs.vector` names.
-            seed: of what a policy that samples draws.
+            vectors: (B, history, n), the inputs that `inputs.vector` names.
+            seed: seed of the draws of a sampling policy.
 
         Returns:
             (B, chunk, 7) float32 in [-1, 1].
 
         Raises:
-            InputError: arrays of other shapes than the policy was trained on, or not finite.
+            InputError: the shapes differ from those trained on, or a value is not finite.
         """
         if vectors.shape[1:2] != (self.history,):
             raise InputError(
@@ -217,15 +217,15 @@ class ChunkPolicy(Policy, abc.ABC):
         return actions.clamp(-1.0, 1.0)
 
     def _seen(self, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return what the heads leave and the vector, both (B, history, …)."""
-        if observed.ndim == 2:  # a single moment, seen ever since
+        """Return the heads' output and the vector, both (B, history, …)."""
+        if observed.ndim == 2:  # a single moment, repeated as its own history
             observed = observed[:, None].expand(-1, self.history, -1)
         visual, vector = self.heads(observed.flatten(0, 1))
         moments = observed.shape[:2]
         return visual.unflatten(0, moments), vector.unflatten(0, moments)
 
     def _copy_to_act(self) -> Policy:
-        """Return the copy that acts: as it was trained, for samplers know no other precision."""
+        """Return the copy used to act, in training precision: samplers support no other."""
         return copy.deepcopy(self).cpu()
 
 

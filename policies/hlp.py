@@ -1,17 +1,17 @@
 """`hlp`: the paper's high-level policy, which classifies the subtask that is due.
 
 The recipe `paper` (paper, Section 4 and appendix): the network of `bc` with the logits of five
-classes at its end; cross-entropy against the phases of whole procedures, a little ahead
-(`training.visits.AHEAD`); visual features beside the tip pose and jaw of both arms.
+classes at its end; cross-entropy against the phases of whole procedures, shifted slightly ahead
+(`training.visits.AHEAD`); visual features with the tip pose and jaw of both arms.
 
-With `progress` in its recipe (configs/recipes/high-level.yaml) it also says how far the present
-subtask is, as stage and progress of SARM do (Chen et al., Stage-aware reward modeling for long
+With `progress` in its recipe (configs/recipes/high-level.yaml) it also predicts the progress of the
+present subtask, like stage and progress in SARM (Chen et al., Stage-aware reward modeling for long
 horizon robot manipulation, arXiv:2509.25358; `lerobot.rewards.sarm` in LeRobot 0.6.1): one more
-output of the same network, a sigmoid, with squared error.
+output of the same network, a sigmoid trained with squared error.
 
-Its logits are calibrated on the episodes held out of its training, so that their softmax is a
-probability: divided by one temperature, which changes no choice (Guo et al., On calibration of
-modern neural networks, ICML 2017, arXiv:1706.04599).
+Its logits are calibrated on the episodes held out of training, so that their softmax is a
+probability. They are divided by one temperature, which changes no choice (Guo et al., On
+calibration of modern neural networks, ICML 2017, arXiv:1706.04599).
 """
 
 from collections.abc import Mapping
@@ -30,8 +30,8 @@ from surgicai_vision.core.errors import InputError, check_at_least
 
 CLASSES = len(names.SUBTASKS)
 TEMPERATURES = (0.1, 10.0)
-"""Between which the temperature is looked for: held-out frames that are all named rightly would
-drive it to 0, and make every later answer a certain one.
+"""Bounds of the search for the temperature: held-out frames that are all classified correctly would
+otherwise drive it to 0, making every later answer certain.
 """
 
 
@@ -40,8 +40,8 @@ class HLPRecipe(Recipe):
     """Settings of the high-level policy.
 
     Attributes:
-        progress: weight of the progress's squared error beside the cross-entropy; 0 for a policy
-            that says no progress. SARM's is 1.
+        progress: weight of the progress's squared error, added to the cross-entropy; 0 for a policy
+            that predicts no progress. SARM uses 1.
     """
 
     progress: float = 0.0
@@ -58,7 +58,7 @@ class HighLevelPolicy(Policy):
     """The MLP that classifies the phase.
 
     Attributes:
-        temperature: what the logits are divided by; 1 before it is fitted.
+        temperature: divisor of the logits; 1 before it is fitted.
     """
 
     temperature: torch.Tensor
@@ -75,7 +75,7 @@ class HighLevelPolicy(Policy):
         """Load a state; one from before calibration has no temperature, and its logits stay.
 
         Returns:
-            Names that were missing and names that were not expected, as torch's own.
+            Missing and unexpected names, as torch returns them.
         """
         whole = {"temperature": torch.ones(()), **state_dict}
         names_left: tuple[list[str], list[str]] = super().load_state_dict(whole, strict, assign)
@@ -107,7 +107,7 @@ class HighLevelPolicy(Policy):
         return loss + self.weight * squares.sum() / known.sum().clamp(min=1)
 
     def calibrate(self, answers: torch.Tensor, target: torch.Tensor) -> None:
-        """Set the temperature that makes held-out frames' subtasks the most likely."""
+        """Set the temperature that maximises the likelihood of held-out frames' subtasks."""
         logits = answers[:, :CLASSES].double() * self.temperature
         fitted = fit_temperature(logits.cpu().numpy(), target[:, 0].long().cpu().numpy())
         self.temperature.fill_(fitted)
@@ -115,7 +115,7 @@ class HighLevelPolicy(Policy):
     def choose(
         self, features: NDArray[np.float32] | None, both_arms: NDArray[np.float32]
     ) -> NDArray[np.int64]:
-        """Return the subtask that is due for a batch as `act` takes it.
+        """Return the subtask that is due, for a batch of the inputs that `act` takes.
 
         Returns:
             (B,) indices in `names.SUBTASKS`.
@@ -127,11 +127,11 @@ class HighLevelPolicy(Policy):
 def fit_temperature(logits: NDArray[np.float64], classes: NDArray[np.int64]) -> float:
     """Return the temperature within `TEMPERATURES` with the smallest cross-entropy.
 
-    The cross-entropy is convex in one over the temperature, so that there is one minimum.
+    The cross-entropy is convex in the inverse temperature, so there is only one minimum.
 
     Args:
         logits: (N, classes).
-        classes: (N,) the right ones.
+        classes: (N,) the correct classes.
     """
     from scipy.optimize import minimize_scalar
     from scipy.special import log_softmax

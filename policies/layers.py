@@ -1,7 +1,7 @@
 """Layers that the policies share: the head of each kind of feature, and the paper's MLP.
 
-A global feature (the paper's) enters as it is; a feature map passes a trained spatial softmax or
-trained convolutions, and tokens a trained attention, before the MLP.
+A global feature (the paper's) enters the MLP as it is. A feature map first passes through a trained
+spatial softmax or trained convolutions, tokens through a trained attention.
 """
 
 import math
@@ -20,7 +20,7 @@ POINTS = 32
 
 @final
 class GlobalFeature(nn.Module):
-    """A global feature, taken as it is."""
+    """A head that passes a global feature on unchanged."""
 
     def __init__(self, dim: int):
         super().__init__()
@@ -33,7 +33,7 @@ class GlobalFeature(nn.Module):
 
 @final
 class SpatialSoftmax(nn.Module):
-    """A trained spatial softmax: where in the image each of `POINTS` learned patterns lies."""
+    """A trained spatial softmax: the image position of each of `POINTS` learned patterns."""
 
     def __init__(self, channels: int, height: int, width: int):
         super().__init__()
@@ -48,7 +48,7 @@ class SpatialSoftmax(nn.Module):
         )
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the expected place of each pattern for flattened maps (B, C·h·w).
+        """Return the expected position of each pattern for flattened maps (B, C·h·w).
 
         Returns:
             (B, 2 · POINTS): x and y in [-1, 1].
@@ -60,10 +60,10 @@ class SpatialSoftmax(nn.Module):
 
 @final
 class MapConvolutions(nn.Module):
-    """Trained convolutions over a map, and `FEATURES` numbers of what they leave.
+    """Trained convolutions over a map, reduced to `FEATURES` numbers.
 
     The map is halved until at most 7 × 7 places are left. Convolutions see the needle's arc as a
-    whole, where a softmax's 1 × 1 patterns see one place at a time.
+    whole, whereas a softmax's 1 × 1 patterns see one place at a time.
     """
 
     FEATURES = 64
@@ -86,7 +86,7 @@ class MapConvolutions(nn.Module):
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Return (B, `FEATURES`) for flattened maps (B, C·h·w)."""
-        # A view's part of wider rows would be copied by the convolution, and once more backwards.
+        # The convolution would copy a slice of wider rows, and again in the backward pass.
         numbers: torch.Tensor = self.layers(rows.unflatten(1, self.shape).contiguous())
         return numbers
 
@@ -114,11 +114,11 @@ MAP_HEADS: Mapping[str, Callable[..., Head]] = {
     "softmax": SpatialSoftmax,
     "convolutions": MapConvolutions,
 }
-"""`Recipe.map_head` → the layer that takes in a feature map."""
+"""`Recipe.map_head` → the head for a feature map."""
 
 
 def _head(shape: tuple[int, ...], map_head: str) -> Head:
-    """Return the first layer for a feature of `shape`."""
+    """Return the head for a feature of `shape`."""
     heads: Mapping[int, Callable[..., Head]] = {
         1: GlobalFeature,
         2: TokenAttention,
@@ -134,10 +134,10 @@ def _head(shape: tuple[int, ...], map_head: str) -> Head:
 
 @final
 class FeatureHeads(nn.Module):
-    """The head of each feature alone: what policies with a network of their own put before it.
+    """Only the head of each feature, for policies that add their own network.
 
     Attributes:
-        dim: length of what the heads leave, 0 without images.
+        dim: length of the heads' output, 0 without images.
     """
 
     def __init__(self, recipe: Recipe, inputs: Inputs):
@@ -149,7 +149,7 @@ class FeatureHeads(nn.Module):
         self.dim = sum(head.dim for head in heads)
 
     def forward(self, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return what the heads leave, (B, dim), and the vector beside the features, (B, n).
+        """Return the heads' output, (B, dim), and the vector fed with the features, (B, n).
 
         Args:
             observed: normalised inputs (B, inputs.dim).
@@ -162,10 +162,10 @@ class FeatureHeads(nn.Module):
 
 @final
 class FeatureMLP(nn.Module):
-    """The paper's network on features beside a vector: layers with BatchNorm before each.
+    """The paper's network on features and a vector: layers, each preceded by BatchNorm.
 
     Attributes:
-        width: length of what the heads leave with the vector beside it.
+        width: length of the heads' output concatenated with the vector.
     """
 
     def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
@@ -188,7 +188,7 @@ class FeatureMLP(nn.Module):
         return answers
 
     def seen(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return what the heads leave with the vector beside it, (B, width)."""
+        """Return the heads' output concatenated with the vector, (B, width)."""
         sizes = [math.prod(shape) for shape in self.shapes]
         *rows, vector = observed.split([*sizes, self.inputs.dim - self.inputs.features], dim=1)
         seen = [head(row) for head, row in zip(self.heads, rows, strict=True)]

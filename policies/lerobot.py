@@ -1,11 +1,11 @@
-"""`act`, `diffusion`, `vqbet`: policies of LeRobot that plan chunks, on frozen features.
+"""`act`, `diffusion`, `vqbet`: LeRobot's policies that plan chunks, on frozen features.
 
     surgicai-vision train --task handoff --policy act --encoder imagenet-lite-early --pool spatial
 
-The networks are LeRobot's and stand in the distribution `lerobot_env_surgicai`
-(`lerobot_env_surgicai.chunk_policies`), which is imported when one is made: LeRobot's import takes
-ten seconds, and what only names a policy starts without it. Here stand their names, what a recipe
-must have, and which actions each learns from.
+The networks are LeRobot's and are in the distribution `lerobot_env_surgicai`
+(`lerobot_env_surgicai.chunk_policies`). It is imported only when a policy is built: LeRobot's
+import takes ten seconds, and commands that only name a policy start without it. This module defines
+the names, what a recipe must have, and which actions each policy learns from.
 """
 
 import functools
@@ -18,13 +18,13 @@ from surgicai_vision.core.errors import InputError
 
 ADAPTER = "lerobot_env_surgicai.chunk_policies"
 DOWN_DIMS = (512, 1024, 2048)
-"""LeRobot's `DiffusionConfig.down_dims` where a recipe has none."""
+"""LeRobot's `DiffusionConfig.down_dims`, for a recipe that sets none."""
 PREDICTED_TOKENS = 3
-"""LeRobot's `VQBeTConfig.n_action_pred_token` where a recipe has none."""
+"""LeRobot's `VQBeTConfig.n_action_pred_token`, for a recipe that sets none."""
 
 
 def horizon(recipe: ChunkRecipe) -> int:
-    """Return how many actions the U-Net denoises: chunk and history, rounded up to its halvings."""
+    """Return how many actions the U-Net denoises: chunk and history, rounded up to halve evenly."""
     widths = recipe.settings.get("down_dims", DOWN_DIMS)
     if not isinstance(widths, list | tuple):
         raise InputError(f"settings: down_dims is {widths}; it must be a list of widths.")
@@ -51,13 +51,13 @@ def _act_offsets(recipe: Recipe) -> range:
 
 
 def _diffusion_offsets(recipe: Recipe) -> range:
-    """Begin as LeRobot does, one step back for each earlier observation."""
+    """Return offsets that begin one step back per earlier observation, as in LeRobot."""
     assert isinstance(recipe, ChunkRecipe)
     return range(1 - recipe.history, 1 - recipe.history + horizon(recipe))
 
 
 def _vqbet_offsets(recipe: Recipe) -> range:
-    """Hold a chunk for each moment that is seen and for each token that is predicted besides."""
+    """Return offsets with a chunk for each moment seen and for each further predicted token."""
     assert isinstance(recipe, ChunkRecipe)
     tokens = recipe.settings.get("n_action_pred_token", PREDICTED_TOKENS)
     if not isinstance(tokens, int):

@@ -1,13 +1,13 @@
-"""`residual`: a frozen policy of behaviour cloning and a small correction of its actions.
+"""`residual`: a frozen behaviour-cloning policy and a small correction of its actions.
 
     action = clip(cloned + bound · tanh(correction), -1, 1)
 
-The correction is an MLP on what the frozen policy sees: what its heads leave of the images, the
-vector beside them, and the action that it would take. Its last layer begins at zero, so that an
-untrained correction changes nothing (Silver et al., Residual policy learning, 2018,
-arXiv:1812.06298). `surgicai-vision train --residual-on` learns it by reinforcement with sparse
-reward, as ResiP does on action chunks (Ankile et al., From imitation to refinement, 2024,
-arXiv:2407.16677); as a policy of `train --policy` both parts are cloned together.
+The correction is an MLP. Its input is the output of the frozen policy's image heads, the vector fed
+with the images, and the action that the frozen policy would take. Its last layer starts at zero, so
+that an untrained correction changes nothing (Silver et al., Residual policy learning, 2018,
+arXiv:1812.06298). `surgicai-vision train --residual-on` trains it by reinforcement learning with a
+sparse reward, as ResiP does on action chunks (Ankile et al., From imitation to refinement, 2024,
+arXiv:2407.16677); with `train --policy` both parts are cloned together.
 """
 
 import copy
@@ -26,7 +26,7 @@ from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError
 
 SMALLEST_STD = 1e-3
-"""What the correction sees and varies less is divided by this."""
+"""Inputs of the correction that vary less are divided by this."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ResidualRecipe(Recipe):
         bound: largest correction of each element of an action.
         correction: width of each hidden layer of the correction.
         algo: the algorithm that trained it; "" where it was cloned.
-        settings: what the algorithm was run with, as data.
+        settings: the algorithm's settings, as data.
     """
 
     bound: float = 0.3
@@ -60,8 +60,8 @@ class Residual(Policy):
     """The frozen policy and its correction; see the module's docstring.
 
     Attributes:
-        sight: length of what the correction sees.
-        sight_mean: mean of each element of it, (sight,).
+        sight: length of the correction's input.
+        sight_mean: mean of each element of that input, (sight,).
         sight_std: standard deviation of each, (sight,).
     """
 
@@ -93,9 +93,9 @@ class Residual(Policy):
         return actions
 
     def look(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return what the correction sees, (B, sight), for normalised inputs.
+        """Return the correction's input, (B, sight), for normalised inputs.
 
-        The last seven are the frozen policy's action.
+        Its last seven values are the frozen policy's action.
         """
         seen = self.network.seen(observed)
         return torch.cat([seen, self.network.layers(seen).tanh()], dim=1)
@@ -106,16 +106,16 @@ class Residual(Policy):
 
     @torch.no_grad()
     def take_base(self, base: Policy) -> None:
-        """Take the weights of the policy that is corrected, and what its inputs are divided by.
+        """Copy the weights and the input statistics of the policy to be corrected.
 
         Args:
-            base: a policy of behaviour cloning, `bc`; its tensors bear the names of this one's.
+            base: a behaviour-cloning policy, `bc`; its tensors have the same names as this one's.
         """
         self.load_state_dict({**self.state_dict(), **base.state_dict()})
 
     @torch.no_grad()
     def take_correction(self, layers: Sequence[nn.Linear]) -> None:
-        """Take the weights of a library's actor, its linear layers in order."""
+        """Copy the weights of a library's actor, given as its linear layers in order."""
         own = [layer for layer in self.correction if isinstance(layer, nn.Linear)]
         for layer, given in zip(own, layers, strict=True):
             layer.weight.copy_(given.weight)
@@ -123,14 +123,14 @@ class Residual(Policy):
 
     @torch.no_grad()
     def standardise(self, sights: NDArray[np.float32]) -> None:
-        """Take mean and standard deviation of what was seen, (n, sight)."""
+        """Set mean and standard deviation from recorded inputs of the correction, (n, sight)."""
         values = sights.astype(np.float64)
         std = np.maximum(values.std(axis=0), SMALLEST_STD)
         self.sight_mean.copy_(torch.from_numpy(values.mean(axis=0)))
         self.sight_std.copy_(torch.from_numpy(std))
 
     def exact(self) -> "Residual":
-        """Return a copy in double precision, as `act` computes."""
+        """Return a copy in double precision, in which `act` computes."""
         return copy.deepcopy(self).cpu().double().eval().requires_grad_(False)
 
 

@@ -1,11 +1,11 @@
-"""Build crtk_msgs for the Python that runs this, beside ROS 2 from its wheels, for tests.
+"""Build crtk_msgs for the Python that runs this script, next to ROS 2 from wheels, for tests.
 
     build/ros/bin/python scripts/crtk_msgs.py
 
-There are no wheels of collaborative-robotics/crtk_msgs, but those of ROS 2 Jazzy bring ROS's own
-generators. Its two messages that `surgicai_vision.robot` speaks are generated in C and Python by
-them, with the type support of Fast DDS, compiled by `gcc` and `g++` into one extension module, and
-put into that Python's site-packages. It is not crtk_msgs as a workspace of ROS builds it.
+There are no wheels of collaborative-robotics/crtk_msgs, but those of ROS 2 Jazzy include ROS's own
+generators. They generate the two messages that `surgicai_vision.robot` uses in C and Python, with
+the type support of Fast DDS. `gcc` and `g++` compile them into one extension module, which is put
+into that Python's site-packages. The result differs from crtk_msgs as built in a ROS workspace.
 """
 
 import os
@@ -63,7 +63,7 @@ const Support * HANDLE(rosidl_typesupport_c, {name})(void)
   return &made;
 }}
 """
-"""What a message's type support is asked for: Fast DDS's own, or a description of its fields."""
+"""Returns the requested type support of a message: Fast DDS's own, or a field description."""
 LIBRARIES = (
     *("std_msgs__rosidl_generator_c", "std_msgs__rosidl_generator_py"),
     *("std_msgs__rosidl_typesupport_fastrtps_c", "std_msgs__rosidl_typesupport_introspection_c"),
@@ -73,13 +73,13 @@ LIBRARIES = (
 
 
 def found_once(group: str, *, specs: list[str] | None = None, **_: object) -> dict[str, object]:
-    """Return name → entry point; the wheels name each of their generators twice."""
+    """Return name → entry point; the wheels list each of their generators twice."""
     found = entry_points.importlib_metadata.entry_points(group=group)
     return {entry.name: entry for entry in found if not specs or entry.name in specs}
 
 
 def generate(folder: Path) -> None:
-    """Generate C and Python of the messages into folder/crtk_msgs."""
+    """Generate the messages' C and Python code in folder/crtk_msgs."""
     entry_points.get_entry_points = found_once
     (folder / "msg").mkdir()
     for name, fields in FIELDS.items():
@@ -101,7 +101,7 @@ def generate(folder: Path) -> None:
 
 
 def compile_all(folder: Path) -> None:
-    """Compile everything below folder/crtk_msgs into one extension module there."""
+    """Compile everything in folder/crtk_msgs into one extension module there."""
     out = folder / PACKAGE
     headers = Path(sys.prefix) / "include"
     include = [folder, headers, *headers.iterdir(), numpy.get_include()]
@@ -119,7 +119,7 @@ def compile_all(folder: Path) -> None:
 
 
 def install(folder: Path) -> Path:
-    """Put what Python needs into site-packages; return where."""
+    """Copy what Python needs into site-packages; return the folder."""
     out = folder / PACKAGE
     there = Path(sysconfig.get_paths()["purelib"]) / PACKAGE
     for path in (*out.rglob("*.py"), *out.rglob("*.so")):

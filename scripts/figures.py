@@ -1,9 +1,9 @@
-"""Print the figures of the house: what `CONTRIBUTING.md` asks of the sources, counted.
+"""Print code metrics: how the sources meet the limits that `CONTRIBUTING.md` sets.
 
     make figures
 
-Counted are the tracked Python files that are shipped; tests, examples and benchmarks are not. The
-exit code is 1 where a limit that binds is passed.
+Only tracked Python files that are shipped are measured, not tests, examples or benchmarks. The exit
+code is 1 if a binding limit is exceeded.
 """
 
 import ast
@@ -23,7 +23,7 @@ NOUNS = ("rendering.py", "training.py", "hole_crossing.py")
 
 
 class Figure(NamedTuple):
-    """What was counted, and the most there may be; a size is orientation and binds nobody."""
+    """A metric and its limit; a limit on size is for orientation only and does not bind."""
 
     name: str
     value: float
@@ -32,7 +32,7 @@ class Figure(NamedTuple):
 
     @property
     def is_within(self) -> bool:
-        """Whether there is no more than there may be."""
+        """Whether the value is within the limit."""
         return self.value <= self.limit
 
 
@@ -47,7 +47,7 @@ def sources() -> list[Path]:
 
 
 def own_imports(tree: ast.AST) -> Iterator[ast.ImportFrom]:
-    """Yield the imports of our own modules that stand inside functions."""
+    """Yield the imports of our own modules inside functions."""
     for function in ast.walk(tree):
         if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
             for node in ast.walk(function):
@@ -65,7 +65,7 @@ def is_packed(node: ast.AST) -> bool:
 
 
 def figures() -> list[Figure]:
-    """Count everything."""
+    """Return all metrics of the sources."""
     lines = 0
     package_lines = 0
     wide = 0
@@ -105,7 +105,7 @@ def figures() -> list[Figure]:
 
 
 def main() -> int:
-    """Print one line a figure."""
+    """Print one line per metric."""
     found = figures()
     for figure in found:
         verdict = "" if figure.is_within else "  too many" if figure.binds else "  (orientation)"

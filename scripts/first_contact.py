@@ -1,11 +1,11 @@
-"""Try a checkout where first contact breaks: odd paths, a home that cannot be written, no OpenGL.
+"""Try a checkout where a first run may fail: odd paths, an unwritable home folder, no OpenGL.
 
-    .venv/bin/python scripts/first_contact.py              # every situation this machine can make
-    .venv/bin/python scripts/first_contact.py no-opengl    # these alone
+    .venv/bin/python scripts/first_contact.py              # every situation this machine can create
+    .venv/bin/python scripts/first_contact.py no-opengl    # only this one
 
-Each situation runs the quickstart, tiny, in a folder of its own and looks at what comes out; one
-that this machine cannot make (another user without being root) is named and left out. Ends with 1
-if one went wrong. CI runs it after the tests.
+Each situation runs a tiny quickstart in its own folder and checks the result. A situation that this
+machine cannot create (another user without being root) is named and left out. The exit code is 1 if
+one went wrong. CI runs it after the tests.
 """
 
 import os
@@ -36,15 +36,15 @@ NO_OPENGL = "No image can be drawn"
 
 @dataclass(frozen=True)
 class Situation:
-    """Where the quickstart is tried.
+    """A situation in which the quickstart is tried.
 
     Attributes:
         folder: name of the folder it runs in.
-        variables: what differs in the environment; None removes a variable.
-        command: comes before the command: another user, another view of the file system.
+        variables: changed environment variables; None removes a variable.
+        command: prefix of the command: another user, or another view of the file system.
         home: mode of the home folder.
-        refused: what it must say where it cannot work; "" where it must work.
-        needs: why this machine cannot make the situation, or "".
+        refused: what it must say if it cannot work in the situation; "" if it must work.
+        needs: returns why this machine cannot create the situation, or "".
     """
 
     folder: str = "work"
@@ -56,7 +56,7 @@ class Situation:
 
 
 def needs_root() -> str:
-    """Return why this process cannot act as another user."""
+    """Return why this process cannot act as another user, or ""."""
     if os.geteuid():
         return "needs root"
     if not shutil.which("setpriv"):
@@ -66,7 +66,7 @@ def needs_root() -> str:
 
 
 def needs_mounts() -> str:
-    """Return why a home folder cannot be made read-only even for root."""
+    """Return why a home folder cannot be made read-only even for root, or ""."""
     if os.geteuid() or not shutil.which("unshare"):
         return "needs root and unshare (util-linux)"
     done = subprocess.run(["unshare", "-m", "true"], capture_output=True, check=False)
@@ -143,7 +143,7 @@ OUTPUTS = ("report.html", "procedure/procedure.mp4", "procedure/strip.jpg")
 
 
 def main(chosen: list[str]) -> int:
-    """Try the situations, all of them by default; print a line each."""
+    """Try the situations, all of them by default; print one line per situation."""
     unknown = set(chosen) - set(SITUATIONS)
     if unknown:
         sys.exit(f"unknown: {', '.join(unknown)}; allowed: {', '.join(SITUATIONS)}")

@@ -1,7 +1,8 @@
-"""Print the renderer of a headless OpenGL context made through EGL, or fail with the reason.
+"""Print the renderer of a headless OpenGL context created through EGL, or fail with the reason.
 
-Runs with any python3 and no package, because it decides whether GL packages must be installed. It
-takes the road MuJoCo takes (libEGL, its devices, libGL), so that its answer is MuJoCo's.
+Runs with any python3 and without packages, because it decides whether GL packages must be
+installed. It creates the context as MuJoCo does (libEGL, its devices, libGL), so its answer holds
+for MuJoCo.
 """
 
 import ctypes
@@ -28,7 +29,7 @@ def load(names):
 
 
 def extension(egl, name, result, *arguments):
-    """Return an EGL extension function, or stop where the driver lacks it."""
+    """Return an EGL extension function, or exit if the driver lacks it."""
     egl.eglGetProcAddress.restype = ctypes.c_void_p
     address = egl.eglGetProcAddress(name)
     if not address:
@@ -54,7 +55,7 @@ def displays(egl):
 
 
 def renderer(egl, gl, display):
-    """Return the GL renderer string of a context on `display`, or None where none can be made."""
+    """Return the GL renderer string of a context on `display`, or None if none can be created."""
     pointer = ctypes.c_void_p
     number = ctypes.c_int
     wanted = (EGL_SURFACE_TYPE, EGL_PBUFFER_BIT, EGL_RENDERABLE_TYPE, EGL_OPENGL_BIT, EGL_NONE)

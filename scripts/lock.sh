@@ -1,5 +1,5 @@
 #!/bin/sh
-# Rewrite requirements.lock and scripts/uv.txt: exact versions with hashes and no address of any index.
+# Rewrite requirements.lock and scripts/uv.txt: exact versions with hashes, without the address of any index.
 # Versions already locked are kept; `UPGRADE=1 make lock` takes the newest allowed.
 set -eu
 

@@ -1,9 +1,9 @@
 """Image-based imitation learning for robotic suturing.
 
-The flow is the vocabulary: scene → env → demos → dataset → features → policy → evaluation → report.
-Importing this package registers the gymnasium ids, one a task. `register_encoder`,
-`register_policy`, `register_task`, `register_camera` and `register_engine` offer parts of one's own
-in this process; docs/extending.md says how a distribution offers them in every process.
+The stages and their names: scene → env → demos → dataset → features → policy → evaluation → report.
+Importing this package registers the gymnasium ids, one per task. `register_encoder`,
+`register_policy`, `register_task`, `register_camera` and `register_engine` add your own parts in
+this process; docs/extending.md says how a distribution offers parts in every process.
 """
 
 from typing import TYPE_CHECKING
@@ -44,7 +44,7 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """List what has been imported and what is on first use."""
+    """List the imported names and those that are imported on first use."""
     return sorted({*globals(), *__all__})
 
 

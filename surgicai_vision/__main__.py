@@ -1,7 +1,7 @@
 """The program `surgicai-vision`, and `python -m surgicai_vision`.
 
-The command line is imported inside `main`: that takes a second, in which Ctrl-C is one line as it
-is later (`commands.main`).
+The command line is imported inside `main`: the import takes a second, during which Ctrl-C must also
+print one line, as it does later (`commands.main`).
 """
 
 import os
@@ -16,7 +16,7 @@ from surgicai_vision.core.plugins import DISTRIBUTION, resolve
 def main() -> int:
     """Run one command and return its exit code."""
     is_heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if is_heard:  # else whoever started the program wants it ignored
+    if is_heard:  # else whoever started the program wants Ctrl-C ignored
         signal.signal(signal.SIGINT, _leave)
     run = resolve("surgicai_vision.commands.main:main")
     if is_heard:
@@ -25,7 +25,7 @@ def main() -> int:
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
-    """End at once: nothing has begun, and an import would not pass an exception on."""
+    """End at once: no work has begun, and an import might not let an exception through."""
     print(f"{DISTRIBUTION}: {INTERRUPTED}", file=sys.stderr, flush=True)
     os._exit(1)
 

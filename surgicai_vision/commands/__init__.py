@@ -7,21 +7,21 @@ A command's module holds
 * `run(options, *, console)`, registered by `@app.default`. It returns the result that `--json`
   prints, with `exit_code` 1 where the command ran and found something wrong.
 
-An option is a field `name: Annotated[type, TRAIT, ...] = default`, with traits of `options.py` or a
-`cyclopts.Parameter` of its own. Its line under `Attributes:` in the docstring is its help, unless
-its trait has one. What cyclopts makes of the type:
+An option is a field `name: Annotated[type, TRAIT, ...] = default`, with traits of `options.py` or
+its own `cyclopts.Parameter`. Its help is its line under `Attributes:` in the docstring, unless a
+trait has a help text. How the type is read:
 
 * `bool`: `--name` and `--no-name`.
-* `tuple[type, ...]`: a comma list, which may also be given piece by piece.
+* `tuple[type, ...]`: a comma list; the option may also be repeated.
 * `type | None`: may be left out; `default_text("...")` says in `--help` what happens then.
 * a field with `dataclasses.field(kw_only=False)`: a positional argument.
 * `FILE_ONLY`: a table that only the `--config` file can give.
 
-Where every option has a default, cyclopts asks for `def run(options: Options = Options(), ...)`.
+Where every option has a default, cyclopts requires `def run(options: Options = Options(), ...)`.
 
-Its line in `COMMANDS` (or in `COMMANDS` of the package that groups several, as `dataset`) makes it
-known. It is imported when it runs or when its `--help` is asked for: what takes long to import
-(torch, mujoco, lerobot) is imported inside functions, here alone.
+A command is registered by its line in `COMMANDS` (or in `COMMANDS` of a package that groups
+several, such as `dataset`). It is imported only when it runs or its `--help` is requested. What
+takes long to import (torch, mujoco, lerobot) is imported inside functions.
 
     @Parameter(name="*")
     @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ def register(app: App, commands: Mapping[str, str], package: str = __name__) -> 
     """Add commands to `app` in this order; each is imported only when it is needed.
 
     Args:
-        app: Gets the commands.
+        app: The app that gets the commands.
         commands: Command → what it does.
         package: Package with the commands' modules.
     """

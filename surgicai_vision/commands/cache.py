@@ -26,8 +26,8 @@ class Options:
 
     Attributes:
         action: What to do with the cached features.
-        keep: Folders of datasets whose features prune keeps.
-        all: Prune every entry.
+        keep: With prune, folders of the datasets whose features are kept.
+        all: With prune, delete every entry.
     """
 
     action: Annotated[str, Parameter(choices=ACTIONS, metavar="ACTION")] = field(kw_only=False)
@@ -37,7 +37,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Print the entries, or delete those of every dataset but the kept ones."""
+    """Print the entries, or delete those of all datasets except the kept ones."""
     from surgicai_vision.features.cache import default_cache_root, list_cache, prune_cache
 
     prune = options.action == "prune"

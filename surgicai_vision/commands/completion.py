@@ -29,7 +29,7 @@ class Options:
     """Options of `completion`.
 
     Attributes:
-        shell: The shell that shall complete.
+        shell: The shell to print the script for.
     """
 
     shell: Annotated[Shell, Parameter(metavar="SHELL")] = field(kw_only=False)

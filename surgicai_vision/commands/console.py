@@ -12,7 +12,7 @@ from surgicai_vision.core.progress import Progress, silent
 @final
 @Parameter(parse=False)
 class Console:
-    """Where a command prints; cyclopts gives it to every command that asks for one."""
+    """Where a command prints; every command with such a parameter gets one."""
 
     def say(self, text: str = "") -> None:
         """Print a line of the result."""

@@ -27,9 +27,9 @@ class Options:
     """Options of `cut-demos`.
 
     Attributes:
-        demos: Demonstrations of whole procedures.
-        subtask: The subtask whose visits are taken.
-        out: Folder to make.
+        demos: Folder with demonstrations of whole procedures.
+        subtask: The subtask whose visits to cut out.
+        out: Folder to create.
     """
 
     demos: Annotated[Path | None, DIRECTORY, default_text(f"outputs/demos/{names.SUTURE}")] = None

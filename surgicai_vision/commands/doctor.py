@@ -11,7 +11,7 @@ app = App(name="doctor", help_epilogue="example:\n  surgicai-vision doctor")
 
 @app.default
 def run(*, console: Console) -> dict[str, object]:
-    """Print one line a check; the exit code is 1 if something must be repaired."""
+    """Print one line per check; the exit code is 1 if something must be repaired."""
     from surgicai_vision.commands.doctor_checks import check
 
     checks = check()

@@ -1,8 +1,8 @@
 """The checks of `doctor`: Python, packages, import names, GL, GPU, encoders and disk.
 
-Whatever can crash a process or take long to import (GL, torch, the encoders) is looked at in a
-process of its own, `python -m surgicai_vision.commands.doctor_checks PROBE`, so that a broken
-driver costs one line and not the report.
+Whatever can crash a process or takes long to import (GL, torch, the encoders) is probed in a
+separate process, `python -m surgicai_vision.commands.doctor_checks PROBE`, so that a broken driver
+costs one line of the report and not all of it.
 """
 
 import importlib.metadata
@@ -42,7 +42,7 @@ class FoundWeights(TypedDict):
     Attributes:
         here: the file is on this machine.
         detail: where it is, or what is missing.
-        broken: the distribution of an encoder that cannot be used, "" of one that can.
+        broken: the distribution of an encoder that cannot be used, "" if it can be.
     """
 
     here: bool
@@ -51,7 +51,7 @@ class FoundWeights(TypedDict):
 
 
 class Finding(TypedDict, total=False):
-    """What a probe found; each fills its own keys, or `error`.
+    """What a probe found; each probe fills in its own keys, or `error`.
 
     Attributes:
         error: why it found nothing.
@@ -72,9 +72,9 @@ class Check:
 
     Attributes:
         name: what was looked at.
-        status: "ok", "warning" (works, or not needed by everybody) or "fail" (must be mended).
+        status: "ok", "warning" (works, or not needed by everybody) or "fail" (must be fixed).
         detail: what was found.
-        advice: what to do, empty where nothing is to be done.
+        advice: what to do; empty if nothing needs doing.
     """
 
     name: str
@@ -283,8 +283,8 @@ def probe_gl() -> Finding:
         return {"error": str(error)}
     try:
         finding["frames_per_second"] = rendering_speed()
-    except Exception as error:  # reported as a line of its own; the context above was made
-        # Nothing was put in that could be wrong, so a wrong input is a camera of other people's.
+    except Exception as error:  # reported in its own line; the context above was created
+        # The user gave no input here, so wrong input means another distribution's camera.
         finding["is_plugin"] = isinstance(error, InputError)
         finding["error"] = (
             str(error) if finding["is_plugin"] else f"{type(error).__name__}: {error}"
@@ -330,7 +330,7 @@ def _found_weights(name: str) -> FoundWeights:
 
     try:
         card = encoders.encoder_card(name)
-    except Exception as error:  # whatever it is, the other encoders are reported
+    except Exception as error:  # whatever it is, the other encoders are still reported
         owner = encoders.ENCODERS.distribution(name)
         return {"here": False, "detail": first_line(error), "broken": owner}
     unpinned = "" if card.sha256 else " (unpinned: the hub's own hash is taken)"

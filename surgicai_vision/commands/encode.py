@@ -41,9 +41,9 @@ class Options:
         dataset: Folder of the dataset.
         encoder: Encoder.
         view: Views to encode.
-        pool: What is taken from the encoder.
-        device: Where it is computed; auto is a GPU where there is one.
-        export: Also write a dataset with the features in place of images, for LeRobot's policies.
+        pool: What to take from the encoder: one vector (global), a feature map (spatial) or tokens.
+        device: Where to compute the features; auto uses a GPU if there is one.
+        export: Also write a dataset with features instead of images, for LeRobot's policies.
     """
 
     task: Annotated[str, TASK] = "grasp"
@@ -61,7 +61,7 @@ class Options:
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode every view and print where the features are."""
     weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
-    # What can be wrong is found before torch is imported.
+    # Wrong input is found before torch is imported.
     encoders.find_weights(options.encoder, weights)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
     if options.export:

@@ -45,9 +45,9 @@ A policy is evaluated in the world it was trained in, also one that varies; a --
 )
 
 ALL = "all"
-"""`--expert-swap`: the policy as it is, and with the expert in for every subtask in turn."""
+"""`--expert-swap`: the policy as it is, then with the expert acting in each subtask in turn."""
 REPLAY = "replay"
-"""The mean demonstration of a dataset, which observes nothing."""
+"""The policy that plays the mean demonstration of a dataset and observes nothing."""
 
 
 @Parameter(name="*")
@@ -60,20 +60,19 @@ class Options:
         episodes: Number of episodes.
         seed: Seed of the first start; each episode takes the next.
         workers: Number of processes.
-        dataset: Dataset whose mean demonstration replay plays.
-        change: For a policy that plans chunks, how they are acted, in the place of its recipe's:
-            execute, samples, ensemble.
-        expert_swap: For a hierarchical policy, the subtask that the expert does, or all: each in
-            turn.
-        upset: Let one thing go wrong in every episode, drawn from its start: the needle is pushed,
-            or jaws open (docs/evaluation.md).
+        dataset: With policy replay, the dataset whose mean demonstration it plays.
+        change: For a policy that plans chunks, values of execute, samples and ensemble to use
+            instead of its recipe's.
+        expert_swap: For a hierarchical policy, the subtask in which the expert acts instead; all
+            takes each subtask in turn.
+        upset: Make one thing go wrong in every episode, drawn by its start's seed: the needle is
+            pushed, or jaws open (docs/evaluation.md).
         out: Folder for the rows; an earlier evaluation in it is replaced.
-        video: Folder for videos of the episodes, one MP4 each; an earlier filming in it is
-            replaced.
-        video_of: Which episodes: all, failures, successes, or a number: of the first so many
+        video: Folder for videos of the episodes, one MP4 each; earlier ones in it are replaced.
+        video_of: With --video, which episodes: all, failures, successes, or N for the first N
             starts.
-        video_view: Views side by side in a video.
-        video_size: Height and width of each view in a video [px], even.
+        video_view: With --video, the views shown side by side.
+        video_size: With --video, height and width of each view [px]; must be even.
     """
 
     policy: PolicyName = field(kw_only=False)
@@ -161,7 +160,7 @@ def varied(config: TaskConfig) -> dict[str, object]:
 
 
 def say_conditions(seeds: range, config: TaskConfig, console: Console) -> None:
-    """Print what the starts are, where a count on them is no result, and how the world varies."""
+    """Print which bank the starts are from, unless held-out, and how the world varies."""
     bank = bank_of(seeds[0])
     if bank != HELD_OUT:
         console.say(
@@ -194,7 +193,7 @@ def open_given(
     expert_swap: str | None = None,
     changes: tuple[str, ...] = (),
 ) -> "PolicySpec":
-    """Return what the options of this verb, or of `robustness`, evaluate."""
+    """Return the policy that the options of this or another command describe."""
     from surgicai_vision.evaluation.policy_spec import open_policy
 
     demonstrated = None
@@ -214,7 +213,7 @@ def open_given(
 
 
 def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
-    """Evaluate a hierarchical policy as it is and with the expert in for each subtask in turn."""
+    """Evaluate a hierarchical policy as it is, then with the expert in each subtask in turn."""
     from surgicai_vision.evaluation.expert_swap import (
         AS_IT_IS,
         CURVES,
@@ -286,7 +285,7 @@ def summary_line(result: dict[str, Any]) -> str:
 
 
 def _bite(result: dict[str, Any]) -> str:
-    """Return medians of the stitch that was made, for the end of a line; "" without one."""
+    """Return the medians of the stitches, to end a line; "" if there are none."""
     entry, leaving, force = (
         result[column]["median"] for column in ("entry_mm", "exit_mm", "tissue_force_n")
     )

@@ -1,4 +1,4 @@
-"""`export-demos`: turn demonstrations into transitions for libraries of reinforcement learning."""
+"""`export-demos`: turn demonstrations into transitions for reinforcement-learning libraries."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,11 +30,11 @@ class Options:
     Attributes:
         task: The demonstrations' task.
         demos: Folder of demonstrations.
-        obs_type: What transitions observe; goal for hindsight relabelling.
-        format: What reads them: npz, Stable-Baselines3, d3rlpy, Minari or robomimic.
-        episodes: Take the first N demonstrations.
-        env: Fields of the env that differ from the recorded one's, such as reward.
-        out: Folder to make.
+        obs_type: What the transitions observe; goal allows hindsight relabelling.
+        format: File format: npz, or that of Stable-Baselines3, d3rlpy, Minari or robomimic.
+        episodes: Take only the first N demonstrations.
+        env: Fields of the env to change from the recorded ones, such as reward.
+        out: Folder to create.
     """
 
     task: Annotated[str, TASK] = "grasp"

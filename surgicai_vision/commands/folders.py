@@ -33,12 +33,12 @@ def train_folder(task: str, name: str, seed: int) -> Path:
 
 
 def evaluation_folder(spec: "PolicySpec", seed: int, episodes: int) -> Path:
-    """Return the folder of one evaluation of a policy, by its first start and their number."""
+    """Return the folder of one evaluation of a policy, by its first start and episodes."""
     return OUTPUTS / "evaluations" / f"{spec.folder_name}-starts{seed}+{episodes}"
 
 
 def robustness_folder(spec: "PolicySpec", seed: int, episodes: int) -> Path:
-    """Return the folder of one policy's curves, by its first start and their number."""
+    """Return the folder of one policy's curves, by its first start and episodes."""
     return OUTPUTS / "robustness" / f"{spec.folder_name}-starts{seed}+{episodes}"
 
 
@@ -46,10 +46,10 @@ def check_folder(out: Path, marker: str, option: str = "--out", ours: Collection
     """Refuse an output folder that cannot be written or holds something else, before any work.
 
     Args:
-        out: the folder to be made or continued.
+        out: the folder to create or continue.
         marker: the file that marks it as ours.
-        option: what the folder was given as, for the message.
-        ours: names of files that a killed run may leave without the mark.
+        option: the option that gave the folder, for the message.
+        ours: names of files that a killed run may leave without the marker.
     """
     files.check_output(out, may_resume=marker, option=option, ours=ours)
     try:
@@ -91,10 +91,10 @@ def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> "Rende
 
 
 def check_file(path: Path, name: str, suffixes: Sequence[str]) -> None:
-    """Make the folder of an output file, before any work.
+    """Refuse an output file that cannot be written, and create its folder, before any work.
 
     Raises:
-        InputError: the file cannot be written, or not in the format that its suffix names.
+        InputError: the file cannot be written, or its suffix is not one of `suffixes`.
     """
     if path.suffix not in suffixes:
         raise InputError(f"{name} {path} ends in '{path.suffix}'; allowed: {', '.join(suffixes)}.")

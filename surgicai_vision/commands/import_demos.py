@@ -1,4 +1,4 @@
-"""`import-demos`: read demonstrations of the original SurgicAI, bags of ROS, LeRobot datasets."""
+"""`import-demos`: read SurgicAI's recordings, ROS bags, LeRobot datasets and logs of drive."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -53,13 +53,13 @@ class Options:
     """Options of `import-demos`.
 
     Attributes:
-        file: A pickle as SurgicAI writes it, an npz of its arrays, a bag, a folder of bags, the
-            folder of a LeRobot dataset, or the log of `robot drive`.
-        task: What it shows; needed for a pickle, which does not say it.
-        out: Folder to make.
-        topic: Topics of a bag that differ from the convention's.
-        convention: Whose topics a bag has.
-        segmentation: What cuts a bag or a dataset into subtasks.
+        file: A pickle as SurgicAI writes it, an npz of its arrays, a ROS bag, a folder of bags,
+            the folder of a LeRobot dataset, or the log of `robot drive`.
+        task: The subtask that the file shows; required for a pickle, which does not say.
+        out: Folder to create.
+        topic: Topics of a bag that differ from those of --convention.
+        convention: Whose topic names a bag uses.
+        segmentation: How to cut a bag or a dataset into subtasks.
     """
 
     file: Annotated[Path, Parameter(metavar="FILE")] = field(kw_only=False)
@@ -154,7 +154,7 @@ def _import_drive_log(path: Path, options: Options, console: Console) -> dict[st
 
 
 def _refuse_topics(options: Options, what: str) -> None:
-    """Refuse options that only bags have; `what` says what is imported in their place."""
+    """Refuse options that are only for bags; `what` says what is imported instead."""
     if options.topic or options.convention:
         raise InputError(f"--topic and --convention are for bags, and {options.file} is {what}.")
 
@@ -166,7 +166,7 @@ def _import_arms(
     unit: str,
     console: Console,
 ) -> dict[str, object]:
-    """Import what holds both arms' poses and no images of ours, by one of its readers."""
+    """Import a file of both arms' poses, without images of ours, with the reader `read`."""
     path = options.file
     with console.stage(f"importing {path.name}", unit) as progress:
         summaries = read(
@@ -203,7 +203,7 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, ob
 
 
 def _told(summaries: "Sequence[BagSummary]", console: Console) -> dict[str, dict[str, object]]:
-    """Print what an import made, and return it as a table: task → what."""
+    """Print what an import made, and return it by task."""
     rows: dict[str, dict[str, object]] = {}
     for made in summaries:
         kept = len(made.paths)
@@ -233,7 +233,7 @@ def _told(summaries: "Sequence[BagSummary]", console: Console) -> dict[str, dict
 
 
 def _config(options: Options) -> BagConfig:
-    """Return the table `bag` with the command line's options put over it."""
+    """Return the table `bag`, overridden by the options of the command line."""
     config = options.bag or BagConfig()
     return dataclasses.replace(
         config,

@@ -36,11 +36,11 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Write the page; exit 1 where a row is not taken."""
+    """Write the page; the exit code is 1 if a row is refused."""
     from surgicai_vision.report.leaderboard import write_leaderboard
 
     page = options.out or options.dir / "leaderboard.html"
-    if options.dir.is_dir():  # else it is refused below, and no folder is made of it
+    if options.dir.is_dir():  # else it is refused below and must not be created
         folders.check_file(page, "--out", (".html",))
     board = write_leaderboard(options.dir, page)
     for name, reason in board.refused.items():

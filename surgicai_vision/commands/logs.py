@@ -1,4 +1,4 @@
-"""Where a training's losses are drawn: TensorBoard, or Weights & Biases where it is installed."""
+"""Where a training's losses are logged: TensorBoard, or Weights & Biases if it is installed."""
 
 import importlib.util
 from collections.abc import Callable, Iterator, Mapping
@@ -9,8 +9,7 @@ from typing import Protocol, final
 from surgicai_vision.core.errors import InputError
 
 LOGS = ("auto", "tensorboard", "wandb", "none")
-"""`auto` is TensorBoard where it is installed. Nothing is sent anywhere unless `wandb` is asked
-for.
+"""`auto` is TensorBoard if it is installed. Nothing is sent anywhere unless `wandb` is requested.
 """
 
 Log = Callable[[int, dict[str, float]], None]
@@ -23,17 +22,17 @@ def installed(package: str) -> bool:
 
 @contextmanager
 def open_log(kind: str, out: Path) -> Iterator[Log | None]:
-    """Yield what takes (epoch, losses by name), or None.
+    """Yield a function of (epoch, losses by name), or None.
 
-    Nothing is opened before the first losses: a finished training that is run again draws nothing.
+    Nothing is opened before the first losses, so running a finished training again logs nothing.
 
     Args:
         kind: one of `LOGS`.
         out: the checkpoint folder; TensorBoard writes into `<out>-tensorboard`, W&B keeps its files
-            beside it.
+            next to it.
 
     Raises:
-        InputError: what was asked for by name is not installed, or nobody is logged in to W&B.
+        InputError: the requested package is not installed, or nobody is logged in to W&B.
     """
     if kind in ("tensorboard", "wandb") and not installed(kind):
         raise InputError(
@@ -49,7 +48,7 @@ def open_log(kind: str, out: Path) -> Iterator[Log | None]:
 
 
 class _Writer(Protocol):
-    """Where losses are drawn."""
+    """Where losses are logged."""
 
     def draw(self, epoch: int, losses: Mapping[str, float]) -> None:
         """Add the losses of an epoch, by name."""
@@ -96,7 +95,7 @@ class _WeightsAndBiases:
 
 
 def _drawing(open_writer: Callable[[Path], _Writer], out: Path) -> Iterator[Log]:
-    """Yield a log that opens its writer with the first losses, and close it at the end."""
+    """Yield a log that opens its writer at the first losses; close the writer at the end."""
     writers: list[_Writer] = []
 
     def log(epoch: int, losses: dict[str, float]) -> None:
@@ -112,7 +111,7 @@ def _drawing(open_writer: Callable[[Path], _Writer], out: Path) -> Iterator[Log]
 
 
 def _check_login() -> None:
-    """Refuse W&B without an account, unless WANDB_MODE=offline keeps the run on this machine."""
+    """Refuse W&B without a login, unless WANDB_MODE=offline keeps the run on this machine."""
     import wandb
 
     if wandb.setup().settings.mode == "online" and not wandb.api.is_authenticated:

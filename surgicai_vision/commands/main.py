@@ -1,9 +1,8 @@
 """The command line: `surgicai-vision COMMAND [OPTIONS]`, built on cyclopts.
 
 Exit codes: 0 done, 1 the work failed or was interrupted, 2 wrong input, 143 ended by SIGTERM.
-Errors made on purpose (`SurgicaiError`) and wrong input are one line without a traceback. A
-command's module, and what it needs, is imported only when that command runs, so `--help` is
-instant.
+Deliberate errors (`SurgicaiError`) and wrong input print one line without a traceback. A command's
+module, and what it needs, is imported only when that command runs, so `--help` is instant.
 """
 
 import errno
@@ -39,7 +38,7 @@ TITLE = (
 FULL = (errno.ENOSPC, errno.EDQUOT)
 NO_ROOM = "The disk is full; make room, and run the same command again to continue."
 TERMINATED = 128 + signal.SIGTERM
-"""Exit code after SIGTERM, as a shell gives it."""
+"""Exit code after SIGTERM, as a shell reports it."""
 EVERYWHERE = Group("Options of every command", sort_key=1)
 
 app = App(
@@ -48,7 +47,7 @@ app = App(
     version=lambda: f"{PROGRAM} {version(PROGRAM)}",
     default_parameter=Parameter(negative_iterable=(), show_env_var=False),
     help_format="plaintext",
-    console=Console(soft_wrap=True),  # an example is never broken at the edge of the window
+    console=Console(soft_wrap=True),  # examples are not wrapped at the edge of the window
     result_action="return_value",
     print_error=False,
     exit_on_error=False,
@@ -66,9 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
         "HF_HUB_DISABLE_PROGRESS_BARS",
         "HF_HUB_DISABLE_TELEMETRY",
     ):
-        os.environ.setdefault(
-            name, "1"
-        )  # the bars are ours; nothing of a run is reported to anyone
+        os.environ.setdefault(name, "1")  # we show our own progress bars, and send no telemetry
     raise_on_terminate()
     _show_what_can_be_shown()
     try:
@@ -81,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{PROGRAM}: {INTERRUPTED}", file=sys.stderr)
         return TERMINATED if isinstance(interrupt, Terminated) else 1
     except BrokenPipeError:
-        # Standard output is gone; Python would complain when it flushes it at exit.
+        # Standard output is closed; Python would complain when flushing it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
@@ -94,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _show_what_can_be_shown() -> None:
-    """Let output hold `?` for a character that its encoding lacks, where it would be an error."""
+    """Print `?` for a character that the output's encoding lacks, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")
@@ -133,7 +130,7 @@ def _fail(error: SurgicaiError) -> int:
 
 
 def explain(error: CycloptsError) -> InputError:
-    """Return what cyclopts found wrong as an error of ours, with the nearest name suggested."""
+    """Return an error of cyclopts as one of ours, with the nearest name suggested."""
     chain = " ".join(error.command_chain or ())
     common = app.meta.assemble_argument_collection()
     match error:

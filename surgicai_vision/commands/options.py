@@ -2,12 +2,12 @@
 
 The options of a command are a frozen dataclass; cyclopts reads its fields, their types and the
 `Attributes:` of its docstring. A trait below is a `cyclopts.Parameter` with what several options
-have in common. It stands in the annotation beside the type, and may be combined with others:
+have in common. It is part of the annotation, next to the type, and may be combined with others:
 
     episodes: Annotated[int, COUNT] = 20
     view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
 
-What is one option in several commands is a whole type, with its help and its default's text:
+An option that several commands share is a complete type, with its help and its default's text:
 
     weights: WeightFiles = ()
 
@@ -32,7 +32,7 @@ from surgicai_vision.core.tasks import task_names
 from surgicai_vision.features import devices, encoders
 
 Source = Callable[[App, tuple[str, ...], ArgumentCollection], None]
-"""What cyclopts calls between reading the command line and converting the texts to values."""
+"""What cyclopts calls after reading the command line and before converting texts to values."""
 
 
 def _whole_number(_: type, tokens: Sequence[Token]) -> int:
@@ -84,22 +84,24 @@ DIRECTORY = Parameter(metavar="DIR")
 COUNT = Parameter(converter=_whole_number, validator=validators.Number(gte=1), metavar="N")
 NOT_NEGATIVE = Parameter(converter=_whole_number, validator=validators.Number(gte=0), metavar="N")
 SEED = within(0, LARGEST_INTEGER)
-"""Seed of a training, or of the first start: no row holds a larger one."""
+"""Seed of a training or of the first start; a row cannot hold a larger number."""
 FRACTION = Parameter(validator=validators.Number(gte=0, lte=1), metavar="P")
 IMAGE_SIZE = Parameter.combine(within(16, 960), Parameter(metavar="PX"))
-"""Height and width [px] that the renderer has room for."""
+"""Height and width [px] within the limits of the renderer."""
 LIST = Parameter(show_default=_show_list)
 UNIQUE = Parameter(show_default=_show_list, validator=_refuse_repetition)
-"""A comma list that holds nothing twice."""
+"""A comma list without repeated values."""
 VIEWS = Parameter.combine(UNIQUE, Parameter(choices=camera_names(), metavar="VIEW[,VIEW]"))
 VIDEO = Parameter(
-    help="Store RGB as video; the error is measured.", choices=("h264", "av1"), metavar="CODEC"
+    help="Store RGB as video with this codec; the error is measured.",
+    choices=("h264", "av1"),
+    metavar="CODEC",
 )
 ENCODER = Parameter(
-    help=f"One of {encoders.encoder_choices()}.", validator=_check_encoder, metavar="NAME"
+    help=f"Encoder: {encoders.encoder_choices()}.", validator=_check_encoder, metavar="NAME"
 )
 ENCODERS = Parameter(
-    help=f"Encoders, of {encoders.encoder_choices()}.",
+    help=f"Encoders, any of {encoders.encoder_choices()}.",
     validator=_check_encoders,
     show_default=_show_list,
     metavar="NAME[,NAME]",
@@ -107,25 +109,25 @@ ENCODERS = Parameter(
 POOL = Parameter(choices=encoders.POOLS)
 DEVICE = Parameter(choices=devices.DEVICES)
 EXECUTOR = Parameter(
-    help="What runs the jobs: local, ray or slurm, with its options, such as ray,address=HOST:PORT "
+    help="What runs the jobs: local, ray or slurm, and its options, such as ray,address=HOST:PORT "
     "or slurm,partition=cpu,minutes=60.",
     metavar="NAME[,KEY=VALUE]",
 )
-"""`executor.open_engine` reads it."""
+"""Read by `executor.open_engine`."""
 FILE_ONLY = Parameter(accepts_keys=False, converter=_refuse_text, show=False)
 """A table that only the `--config` file can give."""
 
 
 def default_text(text: str) -> Parameter:
-    """Return a trait that says what an option without a value of its own defaults to."""
+    """Return a trait with the text that `--help` shows as the option's default."""
     return Parameter(show_default=text)
 
 
 PolicyName = Annotated[
     str,
     Parameter(
-        help="A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`), "
-        "module:factory, or expert, replay, random or zero.",
+        help="The policy: a checkpoint folder, a hierarchical.yaml, released:NAME (see "
+        "`policies`), module:factory, or one of expert, replay, random and zero.",
         metavar="POLICY",
     ),
 ]
@@ -138,16 +140,16 @@ DatasetFolder = Annotated[Path | None, DIRECTORY, default_text("outputs/datasets
 WeightFiles = Annotated[
     tuple[str, ...],
     Parameter(
-        help="File with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone; "
-        "repeat it for another encoder.",
+        help="File with the encoder's pretrained weights; NAME=FILE is for encoder NAME only. May "
+        "be repeated.",
         metavar="[NAME=]FILE",
         show_default=False,
     ),
 ]
-"""`encoders.WeightsSource.parse` reads them, with the next."""
+"""Read by `encoders.WeightsSource.parse`, together with `AcceptLicence`."""
 AcceptLicence = Annotated[bool, Parameter(help="Accept weights under a non-commercial licence.")]
 EnvFields = Annotated[dict[str, object] | None, FILE_ONLY]
-"""Fields of `TaskConfig` that differ; `task_config` or `open_policy` reads them."""
+"""Fields of `TaskConfig` to change; read by `task_config` or `open_policy`."""
 
 
 def task_config(task: str, env: dict[str, object] | None) -> TaskConfig:
@@ -155,7 +157,7 @@ def task_config(task: str, env: dict[str, object] | None) -> TaskConfig:
 
     Raises:
         UnknownName: a key that `TaskConfig` does not have.
-        InputError: a value that is not allowed, or the task itself, which is an option of its own.
+        InputError: a value that is not allowed, or the task itself, which has its own option.
     """
     changes = env or {}
     if "task" in changes:
@@ -164,7 +166,7 @@ def task_config(task: str, env: dict[str, object] | None) -> TaskConfig:
 
 
 def split_comma_lists(_: App, __: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Give every part of a comma list on the command line a token of its own."""
+    """Give every part of a comma list on the command line its own token."""
     for argument in arguments:
         if _is_list(argument):
             argument.tokens = [
@@ -175,7 +177,7 @@ def split_comma_lists(_: App, __: tuple[str, ...], arguments: ArgumentCollection
 
 
 def from_file(path: Path) -> Source:
-    """Return a source that gives every option left out its value in the YAML file `path`."""
+    """Return a source that fills in every option left out from the YAML file `path`."""
 
     def fill(_: App, __: tuple[str, ...], arguments: ArgumentCollection) -> None:
         known = {_key(argument): argument for argument in arguments if argument.keys}
@@ -193,7 +195,7 @@ def from_file(path: Path) -> Source:
 
 
 def _key(argument: Argument) -> str:
-    """Return how an option is called in a file."""
+    """Return the key of an option in a file."""
     return argument.name.lstrip("-").replace("-", "_")
 
 
@@ -207,7 +209,7 @@ def _parts(text: str, name: str) -> list[str]:
     """Return the parts of a comma list.
 
     Raises:
-        InputError: the list is empty, or nothing stands before, between or after two commas.
+        InputError: the list is empty, or has an empty part.
     """
     parts = [part.strip() for part in text.split(",")]
     if not all(parts):
@@ -217,7 +219,7 @@ def _parts(text: str, name: str) -> list[str]:
 
 
 def _tokens(argument: Argument, key: str, value: object, path: Path) -> list[Token]:
-    """Return a file's value as the texts that would stand on the command line, where it has such.
+    """Return a file's value as tokens, with the text of a command line where it has one.
 
     Raises:
         InputError: the value is of another type than the option.
@@ -244,7 +246,7 @@ def _tokens(argument: Argument, key: str, value: object, path: Path) -> list[Tok
 
 
 def _writable(text: str, where: str) -> str:
-    """Return a text of a file that a command line, and so the name of a file, can hold.
+    """Return a file's text, if a command line, and thus the name of a file, can hold it.
 
     Raises:
         InputError: it holds a NUL, or half of a character (a lone surrogate).
@@ -261,7 +263,7 @@ def _writable(text: str, where: str) -> str:
 
 
 def _written_as(hint: type) -> type:
-    """Return the type that a file holds where an option has type `hint`."""
+    """Return the type in a file of an option of type `hint`."""
     if hint is Path:
         return str
     return tuple[str, ...] if hint == tuple[Path, ...] else hint

@@ -25,7 +25,7 @@ class Line:
         sees: its views.
         demonstrations: what it was trained on.
         scene: the scene's hash, shortened.
-        usable: whether that is the present scene.
+        usable: whether it can be used in the present scene.
         licence: its licence.
         problem: why it cannot be used, or "".
     """
@@ -43,7 +43,7 @@ class Line:
 
 @app.default
 def run(*, console: Console) -> dict[str, object]:
-    """Print a line a policy: what it does, how often, and whether it is of the present scene."""
+    """Print one line per policy: its task, its successes and whether it fits the present scene."""
     from surgicai_vision.core.errors import InputError
     from surgicai_vision.training.released import (
         PREFIX,

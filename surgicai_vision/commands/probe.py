@@ -44,9 +44,9 @@ class Options:
         task: The dataset's task.
         dataset: Folder of the dataset.
         encoder: Encoders to probe.
-        view: Views to probe, each alone and all side by side.
-        pool: What is taken from the encoder.
-        seed: Seed of the folds and of the intervals.
+        view: Views to probe, each alone and all together.
+        pool: What to take from the encoder: one vector (global), a feature map (spatial) or tokens.
+        seed: Seed of the cross-validation folds and of the confidence intervals.
         out: Folder for probe.json; an earlier one is replaced.
     """
 
@@ -77,7 +77,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     )
     out = options.out or folders.OUTPUTS / "probes" / label
     check_output(out, may_resume=RESULT)
-    needle_pose(dataset)  # before all of it is encoded
+    needle_pose(dataset)  # fails before anything is encoded
     rows = [row for encoder in options.encoder for row in _rows(options, encoder, dataset, console)]
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / RESULT, rows)

@@ -30,18 +30,18 @@ class Options:
     """Options of `quickstart`.
 
     Attributes:
-        procedure: Who sews the whole procedure of the first act; null in a --config file leaves
-            the act out.
+        procedure: Policy that sews the whole procedure in the first act; null in a --config file
+            skips that act.
         task: The task of the second act.
-        demonstrations: Expert demonstrations.
-        noise: How much what the expert executes is disturbed.
-        view: Rendered views.
+        demonstrations: Number of expert demonstrations.
+        noise: Standard deviation of the noise on the expert's motions, in units of their range.
+        view: Views to render.
         size: Height and width of images [px].
-        frame_stride: Control steps from frame to frame.
-        episodes: Held-out starts of each evaluation.
+        frame_stride: Control steps from one frame to the next.
+        episodes: Number of held-out starts per evaluation.
         seed: Training seed.
         workers: Number of processes.
-        out: Folder to make or to continue.
+        out: Folder to create or continue.
     """
 
     procedure: Annotated[str | None, Parameter(metavar="POLICY")] = Quickstart.procedure

@@ -43,29 +43,30 @@ class Options:
     Attributes:
         task: The task.
         episodes: Successful episodes to keep.
-        demonstrator: Who acts: expert; search, the expert without the grasp's goal; recover, the
-            expert of the whole procedure that goes back to what was lost; dmp, movement primitives
-            learned from --from; multiply, the demonstrations of --from re-posed to new starts.
+        demonstrator: Who acts: expert; search (the expert without the grasp's goal); recover (the
+            expert of the whole procedure, which goes back after a loss); dmp (movement primitives
+            learned from --from); multiply (the demonstrations of --from, re-posed to new starts).
         from_: Demonstrations to learn from (--demonstrator dmp) or to re-pose (multiply).
-        demos_used: How many of them.
-        source: Which of them an episode re-poses (--demonstrator multiply): the one whose start
-            was most alike, or one drawn at random.
+        demos_used: How many demonstrations of --from to use.
+        source: With --demonstrator multiply, the demonstration that an episode re-poses: the one
+            with the nearest start, or a random one.
         seed: Seed of the first start; each episode takes the next.
         noise: Standard deviation of the noise on executed motions, in units of an action's range;
             labels stay the expert's.
-        noise_from: Lowest such deviation: each episode draws its own between this and --noise.
-        jaw_noise: Standard deviation of the noise on the jaw's motion while it is not told to
+        noise_from: Lowest standard deviation of the noise; each episode draws its own between this
+            and --noise.
+        jaw_noise: Standard deviation of the noise on the jaw's motion while it is not commanded to
             close.
-        perturb_start_fraction: Share of episodes that start with a push that is not recorded.
+        perturb_start_fraction: Share of episodes that start with an unrecorded random motion.
         upset_fraction: Share of episodes in which something goes wrong once: the needle is pushed,
             or jaws open (docs/demos.md).
         late: Most control steps by which --demonstrator recover notices a loss late; each episode
-            draws its own.
+            draws its own delay.
         learner: A checkpoint, or released:NAME, that acts until a step drawn at random; labels
             stay the expert's (DAgger).
-        post_success_steps: Control steps that an episode goes on after its success.
+        post_success_steps: Control steps that an episode continues after its success.
         workers: Number of processes.
-        out: Folder to make or to continue.
+        out: Folder to create or continue.
     """
 
     task: Annotated[str, TASK] = "grasp"
@@ -105,7 +106,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             f"--noise-from is {options.noise_from:g}; "
             f"it must be at most --noise, {options.noise:g}."
         )
-    # Everything that can be wrong is found before any work: the engine, the task, the folders.
+    # Wrong input is found before any work: the engine, the task, the folders.
     context = RunContext(options.workers, open_engine(options.executor), console.stage)
     config = task_config(options.task, options.env)
     out = options.out or folders.demos_folder(options.task)
@@ -132,7 +133,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         learner=learner,
         context=context,
     )
-    # A start that the demonstrator failed from is named in the marker and counts in the share.
+    # A start from which the demonstrator failed is in the marker and counts in the share.
     marker = read_marker(out)
     tried = len(paths) + len(marker["skipped"])
     bounds = clopper_pearson(len(paths), tried)
@@ -156,7 +157,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 
 
 def _learner(folder: Path, config: TaskConfig) -> "Learner":
-    """Return the learner that drives."""
+    """Return the learner that acts."""
     from surgicai_vision.experiments.dagger import learner_of
 
     return learner_of(folder, config)

@@ -1,4 +1,4 @@
-"""`release`: build the policies that come with the product, from nothing."""
+"""`release`: build the policies that come with the product, from scratch."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,14 +27,14 @@ class Options:
     """Options of `release`.
 
     Attributes:
-        plan: YAML file that says what is built.
-        only: Build these alone; suture is put together of parts that are there.
-        demonstrations: Demonstrations of each kind, in place of the plan's.
-        epochs: Passes over the frames, in place of the recipe's.
-        episodes: Held-out starts of each evaluation, in place of the plan's.
-        size: Height and width of images [px], in place of the plan's.
+        plan: YAML file that says what to build.
+        only: Build only these policies; suture is assembled from existing ones.
+        demonstrations: Number of demonstrations of each kind, instead of the plan's.
+        epochs: Number of passes over the frames, instead of the recipe's.
+        episodes: Number of held-out starts per evaluation, instead of the plan's.
+        size: Height and width of images [px], instead of the plan's.
         workers: Number of processes.
-        out: Folder of the work, to make or to continue; the policies go into the package, or into
+        out: Working folder, to create or continue; the policies go into the package, or into
             $SURGICAI_VISION_RELEASED.
     """
 

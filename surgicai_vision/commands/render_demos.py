@@ -44,22 +44,22 @@ class Options:
     """Options of `render-demos`.
 
     Attributes:
-        demos: Demonstrations to render, or several folders of them.
-        task: Without --demos, the task.
-        episodes: Without --demos, demonstrations to record.
-        seed: Without --demos, seed of the first start.
+        demos: One or more folders of demonstrations to render.
+        task: Without --demos, the task to record.
+        episodes: Without --demos, the number of demonstrations to record.
+        seed: Without --demos, the seed of the first start.
         view: Views to render.
-        layout: Columns of the dataset: ours, or both arms' poses as Open-H-Embodiment has them.
+        layout: Columns of the dataset: ours, or both arms' poses as in Open-H-Embodiment.
         size: Height and width of images [px].
-        depth: Render depth beside RGB.
-        segmentation: Render the parts beside RGB.
-        frame_stride: Render every N-th frame alone: many episodes at the cost of few.
-        appearance: Looks to draw, whatever was recorded: train, heldout or a family's name.
-        distractors: Most things that lie about, drawn with the look.
-        variants: Looks in which each demonstration is rendered.
+        depth: Also render depth.
+        segmentation: Also render a segmentation into parts.
+        frame_stride: Render only every N-th frame, which costs less time and space per episode.
+        appearance: Looks to draw instead of the recorded ones: train, heldout or a family's name.
+        distractors: Largest number of distractor objects, drawn with the look.
+        variants: Number of looks in which to render each demonstration.
         corruption: Largest strength of smoke, blur and pixel noise, each drawn with the look.
         workers: Number of processes.
-        out: Dataset to make.
+        out: Folder of the dataset to create.
     """
 
     demos: Annotated[
@@ -104,7 +104,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     from surgicai_vision.dataset.render import check_request
     from surgicai_vision.scene.opengl import check_opengl
 
-    # Everything that can be wrong is found before any work.
+    # Wrong input is found before any work.
     context = RunContext(options.workers, open_engine(options.executor), console.stage)
     if options.demos and (options.task or options.episodes or options.env):
         raise InputError(
@@ -126,7 +126,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     check_request(options.view, options.size, options.frame_stride, options.video, options.layout)
     if not options.demos:
         layout.task_config(task_config(task, options.env), options.frame_stride)
-    if context.engine == LOCAL:  # elsewhere it is the workers that must draw
+    if context.engine == LOCAL:  # with other engines the workers must be able to draw
         check_opengl()
     demos = options.demos or [_record(options, task, console)]
     summary = render_demos(

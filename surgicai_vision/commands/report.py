@@ -26,8 +26,8 @@ class Options:
 
     Attributes:
         dir: Folder with results of quickstart, evaluate, robustness or sweep.
-        out: Where to write the page; tables/ stands beside it.
-        strips: Film strips at most, as far as the page's budget allows.
+        out: Page to write; the folder tables/ is written next to it.
+        strips: Largest number of film strips, as far as the page's size budget allows.
     """
 
     dir: Annotated[Path, Parameter(metavar="DIR")] = field(kw_only=False)
@@ -61,7 +61,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
 
 def _planned(folder: Path, console: Console) -> "Sequence[PlannedRun]":
-    """Return every run of the sweep in `folder` with its state; nothing where it is no sweep.
+    """Return every run of the sweep in `folder` with its state; nothing if it holds no sweep.
 
     Raises:
         BadFile: another version wrote the sweep.

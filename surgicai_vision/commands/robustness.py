@@ -45,13 +45,13 @@ class Options:
 
     Attributes:
         task: The task.
-        axis: What shifts.
-        strength: How much, from 0 (not at all) to 1, increasing.
+        axis: Axes to shift, each alone.
+        strength: Strengths of the shift, from 0 (none) to 1, increasing.
         episodes: Number of episodes at each strength.
         seed: Seed of the first start; each episode takes the next.
         workers: Number of processes.
-        dataset: Dataset whose mean demonstration replay plays.
-        out: Folder to make or to continue.
+        dataset: With policy replay, the dataset whose mean demonstration it plays.
+        out: Folder to create or continue.
     """
 
     policy: PolicyName = field(kw_only=False)

@@ -36,11 +36,11 @@ class Options:
     """Options of `saliency`.
 
     Attributes:
-        policy: A checkpoint folder, released:NAME (see `policies`) or module:factory, of a policy
-            that sees images.
+        policy: A policy that sees images: a checkpoint folder, released:NAME (see `policies`) or
+            module:factory.
         task: The task.
         seed: Seed of the start.
-        step: Control steps at which parts of the images are hidden.
+        step: Control steps at which to hide parts of the images.
         patch: Side of the hidden square [px]; squares lie half a side apart.
         out: Image to write.
     """

@@ -33,7 +33,7 @@ FILM_FRAMES = 6
 ANIMATION_EVERY = 4
 """Control steps from one image of an animation to the next."""
 ANIMATION_SPEED = 2.0
-"""Of the world in an animation."""
+"""Speed of the world in an animation."""
 FIGURE_SUFFIXES = (".png", ".jpg", ".pdf", ".svg")
 ALL = "all"
 PLAIN = "plain"
@@ -59,17 +59,17 @@ class Options:
         seed: Seed of the start.
         view: Views to show.
         size: Height and width of each image [px].
-        quality: fast (as datasets are rendered) or high.
-        sheet: File to write.
-        film: Draw a film strip of the expert in every subtask instead, in the first view.
-        animation: Draw the expert's episode as an animation instead, in the first view.
-        axes: Draw every axis of `robustness` at every strength instead, in the first view.
-        looks: Draw families of looks instead, a row each: every view at seeds from --seed on.
-        appearance: Families of --looks: all, train, heldout, plain, or names.
-        draws: Seeds of --looks.
-        distractors: Most things that lie about in --looks, 0 to 5.
-        needles: Draw every needle that randomisation can draw instead, in the first view.
-        placements: Draw the phantom's places and pairs instead, in the first view.
+        quality: Rendering quality: fast (as for datasets) or high.
+        sheet: Image to write.
+        film: Instead of the sheet, a film strip of the expert in every subtask, in the first view.
+        animation: Instead of the sheet, the expert's episode as an animation, in the first view.
+        axes: Instead of the sheet, every axis of `robustness` at every strength, in the first view.
+        looks: Instead of the sheet, a row per family of looks: every view at seeds from --seed on.
+        appearance: Families shown by --looks: all, train, heldout, plain, or names of families.
+        draws: Number of seeds shown by --looks.
+        distractors: Largest number of distractor objects in --looks, 0 to 5.
+        needles: Instead of the sheet, every needle that randomisation can draw, in the first view.
+        placements: Instead of the sheet, the phantom's places and hole pairs, in the first view.
     """
 
     task: Annotated[str, TASK] = "grasp"
@@ -119,7 +119,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         episode = evaluate(
             agents.ExpertAgent, config, [options.seed], workers=1, progress=progress
         )[0]
-    # One row a view; the columns are the modalities at the start, then those at the end.
+    # One row per view; the columns are the modalities at the start, then those at the end.
     moments = {
         "start": episode.film.states[0],
         f"end, step {episode.row.steps}": episode.film.states[-1],

@@ -28,12 +28,12 @@ class Options:
 
     Attributes:
         evaluation: Folder that `evaluate --out` or a sweep wrote.
-        name: The policy, as the page is to call it.
-        by: Who measured it.
-        link: Where its code or paper is, https://…
+        name: Name of the policy on the leaderboard.
+        by: Who measured the policy.
+        link: Address of the policy's code or paper, https://…
         minutes: Minutes of training.
-        hardware: What it was trained on.
-        note: Whatever a reader must know.
+        hardware: Hardware that the policy was trained on.
+        note: Anything else that a reader must know.
         out: The file to write.
     """
 
@@ -71,6 +71,6 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
 
 def _check_out(out: Path) -> None:
-    """Refuse a row's file that is there already or cannot be written."""
+    """Refuse a row's file that exists already or cannot be written."""
     check_output(out)
     folders.check_file(out, "--out", (".json",))

@@ -1,4 +1,4 @@
-"""`sweep`: encode, train and evaluate every cell of a grid, or rebuild a plan from nothing."""
+"""`sweep`: encode, train and evaluate every cell of a grid, or rebuild a plan from scratch."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,18 +48,18 @@ class Options:
     """Options of `sweep`.
 
     Attributes:
-        grid: The grid, or the plan; shipped ones also by their name (smoke).
-        out: Folder to make or to continue.
-        only: Work on these runs alone, by an axis of the grid, or by condition; repeat it for
+        grid: YAML file of a grid or a plan, or the name of a shipped one (smoke).
+        out: Folder to create or continue.
+        only: Work only on these runs, by an axis of the grid or by condition; may be repeated for
             another axis; views are joined by +.
-        demonstrations: Demonstrations of each dataset, in place of the file's.
-        epochs: Passes over the frames, in place of the recipes'.
-        episodes: Starts of each evaluation, in place of the file's.
-        size: Height and width of images [px], in place of the file's.
-        dry_run: List the runs, what is there already and about how long the rest takes; no work.
-        workers: Runs at a time; the results do not depend on it.
-        attempts: How often a run is started whose process is killed.
-        device: Where to encode and train; auto is a GPU where there is one.
+        demonstrations: Number of demonstrations per dataset, instead of the file's.
+        epochs: Number of passes over the frames, instead of the recipes'.
+        episodes: Number of starts per evaluation, instead of the file's.
+        size: Height and width of images [px], instead of the file's.
+        dry_run: Only list the runs, what is done already and about how long the rest takes.
+        workers: Number of runs at a time; the results do not depend on it.
+        attempts: How many times to start a run whose process is killed.
+        device: Where to encode and train; auto uses a GPU if there is one.
     """
 
     grid: Annotated[str, Parameter(metavar="GRID.yaml")] = field(kw_only=False)
@@ -117,7 +117,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 def _list(
     grid: "Experiment", out: Path, choice: "Choice", workers: int, console: Console
 ) -> dict[str, object]:
-    """Print what each run is, and how long the rest takes where a finished run tells it."""
+    """Print each run's state, and how long the rest takes if a finished run can tell."""
     from surgicai_vision.experiments.sweep.estimate import estimate
     from surgicai_vision.experiments.sweep.plan import NOT_RUN, STATES, lacking, plan
 
@@ -168,7 +168,7 @@ def grid_file(given: str) -> Path:
 
 
 def read_experiment(path: Path) -> "Experiment":
-    """Read a grid, a plan, which lists its policies, or a grid over algorithms."""
+    """Read a grid, a plan (which lists its policies) or a grid over algorithms."""
     table = read_yaml(path)
     if "algo" in table:
         return from_mapping(RLGrid, _with_lists(table), str(path))
@@ -176,7 +176,7 @@ def read_experiment(path: Path) -> "Experiment":
 
 
 def _with_lists(table: dict[str, object]) -> dict[str, object]:
-    """Return a table whose axes are lists, where one value may be written without brackets."""
+    """Return a table with its axes as lists; one value may be written without brackets."""
     return {
         key: [value] if key in AXES and type(value) in (str, int) else value
         for key, value in table.items()

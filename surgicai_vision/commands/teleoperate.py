@@ -49,19 +49,19 @@ class Options:
 
     Attributes:
         task: The task.
-        port: Port of the page on this machine's loopback, 0 for any.
-        view: Views shown; the first leads.
+        port: Port of the page on this machine's loopback; 0 takes any free port.
+        view: Views to show; the first is the leading view.
         size: Height and width of images [px].
-        frame: Whose axes the keys mean: those of the camera of the leading view, or the tool's.
+        frame: Axes that the keys refer to: those of the leading view's camera, or the tool's.
         speed: Share of the step size that a key or a full deflection commands.
-        pace: Share of real time; 0.5 gives twice the time to react.
-        seconds: Simulated seconds an attempt may take.
-        episodes: Stop when so many more are kept.
-        seed: Seed of a new folder's first start.
+        pace: Speed as a share of real time; 0.5 gives twice the time to react.
+        seconds: Simulated seconds that an attempt may take.
+        episodes: Stop after this many more episodes are kept.
+        seed: Seed of the first start in a new folder.
         auto_keep: Keep a success without asking.
-        keep_failures: → keeps an episode without success too.
-        skip_idle: The world stands still while nothing is held, and pauses are not recorded.
-        out: Folder to make or to continue.
+        keep_failures: Let → also keep an episode without success.
+        skip_idle: Stop the world while nothing is held; pauses are not recorded.
+        out: Folder to create or continue.
     """
 
     task: Annotated[str, TASK] = "grasp"

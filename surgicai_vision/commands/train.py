@@ -78,41 +78,41 @@ class Options:
     Attributes:
         task: The dataset's task.
         dataset: Folder of the dataset.
-        subtask: Take one subtask's frames of a dataset of whole procedures, for a hierarchical
-            policy.
+        subtask: Train on one subtask's frames of whole procedures, for a hierarchical policy.
         view: Views that the policy sees.
-        pool: What is taken from the encoder.
+        pool: What to take from the encoder: one vector (global), a feature map (spatial) or tokens.
         policy: The kind of policy.
         change: Replace values of the recipe, such as clock=false,map_head=softmax, or one entry of
             a table in it, such as settings.use_vae=false.
-        epochs: Passes over the frames.
-        minutes: In their place: as many as fit into so many minutes of one core, for policies that
-            plan chunks.
-        device: Where to encode and train; auto is a GPU where there is one.
+        epochs: Number of passes over the frames.
+        minutes: For a policy that plans chunks, as many epochs as fit into this many minutes of one
+            core, instead of --epochs.
+        device: Where to encode and train; auto uses a GPU if there is one.
         start: Checkpoint, or released:NAME, to start from, with the same inputs (fine-tuning).
-        progress_from: Checkpoint, or released:NAME, of a high-level policy whose progress a recipe
-            with progress_input=true feeds.
-        save_every: Also keep a checkpoint every N epochs; 0 keeps the last alone.
-        log: Where losses are drawn.
+        progress_from: Checkpoint, or released:NAME, of a high-level policy; it predicts the
+            progress that a recipe with progress_input=true feeds to the policy.
+        save_every: Also keep a checkpoint every N epochs; 0 keeps only the last.
+        log: Where to log losses; auto uses TensorBoard if it is installed.
         seed: Training seed.
-        out: Checkpoint folder to make or to continue.
+        out: Checkpoint folder to create or continue.
         algo: Train an actor on the state by this algorithm of reinforcement or offline learning
-            (docs/rl.md); --change then changes its settings.
-        demos: Folder of the demonstrations that it learns from; without --algo those of the
-            dataset, for a policy that plans chunks of a dataset with few frames.
-        demonstrations: Take the first N of them, or of the dataset.
-        observation: What the actor sees of the state.
-        env_steps: Control steps in the env; offline algorithms take none.
-        updates: Updates of an offline algorithm.
-        validation: Episodes of each evaluation on the way.
-        seeds: Train so many seeds, from --seed on, side by side.
+            (docs/rl.md); --change then changes the algorithm's settings.
+        demos: With --algo, folder of demonstrations to learn from; otherwise the demonstrations of
+            the dataset, for a policy that plans chunks when the dataset has few frames.
+        demonstrations: Use only the first N demonstrations of --demos, or of the dataset.
+        observation: With --algo, what the actor sees of the state.
+        env_steps: With --algo, control steps in the env; offline algorithms take none.
+        updates: With an offline --algo, the number of updates.
+        validation: With --algo, episodes of each evaluation during training.
+        seeds: With --algo, train this many seeds, from --seed on, side by side.
         low: YAML file of a hierarchical policy (docs/hierarchical.md) with hlp: order; PPO learns
             the high-level policy over its subtasks' policies.
-        decisions: Decisions that it learns from.
+        decisions: With --low, the number of decisions to learn from.
         residual_on: Checkpoint, or released:NAME, of a cloned image policy; TD3 learns a correction
             of its actions.
-        bound: Largest correction of each element of an action.
-        workers: Processes that train seeds, or step the envs of a single one; 0 for this one.
+        bound: With --residual-on, the largest correction of each element of an action.
+        workers: With --algo, processes that train seeds, or step the envs of a single seed; 0 uses
+            this process.
         env: Fields of the env, such as hold_jaw.
     """
 
@@ -122,7 +122,7 @@ class Options:
     encoder: Annotated[
         str,
         Parameter(
-            help=f"One of {encoders.encoder_choices()}; none for proprioception alone, state for "
+            help=f"Encoder: {encoders.encoder_choices()}; none for proprioception alone, state for "
             "the state with the goal.",
             validator=_check_encoder,
             metavar="NAME",
@@ -254,7 +254,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 
 
 def _tell_errors(checkpoint: Checkpoint, console: Console) -> None:
-    """Say how a high-level policy did on the episodes held out."""
+    """Print how well a high-level policy did on the held-out episodes."""
     errors = checkpoint.stage_errors
     if errors is None:
         return
@@ -279,13 +279,13 @@ def _views(options: Options, encoder: str | None) -> tuple[str, ...]:
 IMITATION = ("dataset", "subtask", "view", "start", "epochs", "minutes", "device")
 """Options that only imitation from a dataset reads."""
 LARGEST_REINFORCED_SEED = 2**32 - 1
-"""Largest seed of Stable-Baselines3 and d3rlpy, as of NumPy's old generator."""
+"""Largest seed of Stable-Baselines3 and d3rlpy, as of NumPy's legacy generator."""
 REINFORCEMENT = ("observation", "env_steps", "updates", "validation", "seeds", "decisions", "bound")
-"""Options that it does not read, nor `env`; `workers` changes no result."""
+"""Options that imitation does not read, like `env`; `workers` changes no result."""
 
 
 def _refuse_reinforcement(options: Options) -> None:
-    """Refuse what imitation would leave unread, wherever it is not the default."""
+    """Refuse options that imitation would ignore, if they differ from their defaults."""
     if options.env:
         raise InputError(
             "env is for --algo: imitation takes the env of its dataset; leave it out, or record "
@@ -359,7 +359,7 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
 
 
 def _checked_folders(options: Options, runs: Sequence[RunConfig]) -> list[Path]:
-    """Return the runs' checkpoint folders; refuse any that cannot be one, before any work.
+    """Return the runs' checkpoint folders; refuse unusable ones before any work.
 
     Raises:
         InputError: a folder that cannot be written, or a seed that the libraries do not take.
@@ -373,7 +373,7 @@ def _checked_folders(options: Options, runs: Sequence[RunConfig]) -> list[Path]:
 
 
 def _high_level(options: Options, low: Path, console: Console) -> dict[str, object]:
-    """Train PPO as high-level policy over low-level ones; print where the checkpoints are."""
+    """Train a high-level policy over low-level ones by PPO; print where the checkpoints are."""
     from surgicai_vision.rl.extra import check_extra
 
     if options.algo != "ppo" or options.task != names.SUTURE:

@@ -46,16 +46,16 @@ class Options:
 
     Attributes:
         task: The task.
-        seed: Seed of the first start; the next ones follow.
-        episodes: End after so many episodes.
-        go_on: The next start begins by itself.
+        seed: Seed of the first start; each episode takes the next.
+        episodes: End after this many episodes.
+        go_on: Begin the next start automatically.
         paused: Wait at the first start.
-        window: MuJoCo's own viewer in place of the page; needs a display.
-        port: Port of the page on this machine's loopback, 0 for any.
-        view: Views shown at first; the first leads.
+        window: Use MuJoCo's own viewer instead of the page; needs a display.
+        port: Port of the page on this machine's loopback; 0 takes any free port.
+        view: Views to show initially; the first is the leading view.
         size: Height and width of images [px].
-        dataset: Dataset whose mean demonstration replay plays.
-        expert_swap: For a hierarchical policy, the subtask that the expert does.
+        dataset: With policy replay, the dataset whose mean demonstration it plays.
+        expert_swap: For a hierarchical policy, the subtask in which the expert acts instead.
     """
 
     policy: PolicyName = field(kw_only=False)

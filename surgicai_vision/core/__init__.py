@@ -1,1 +1,1 @@
-"""Core: what every stage stands on: names, configuration, errors, files, processes."""
+"""Core: what every stage builds on: names, configuration, errors, files, processes."""

@@ -1,9 +1,9 @@
 """Banks of starts: what a start is for, by its seed.
 
-Demonstrations begin, and reinforcement learns, from training starts; choices are made on validation
-starts; results are counted on held-out ones. The banks never meet.
+Demonstrations and reinforcement learning begin from training starts, choices are made on validation
+starts, and results are measured on held-out ones. The banks never overlap.
 
-bank_of(900_000) == HELD_OUT
+    bank_of(900_000) == HELD_OUT
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ BANKS: Mapping[str, int] = MappingProxyType(
 """Bank of an evaluation's starts, as a grid names it → its first seed."""
 
 HELD_OUT, VALIDATION, TRAINING = "held-out", "validation", "training"
-"""What a start is to a policy."""
+"""What a start may be for a policy."""
 
 USES: Mapping[str, str] = MappingProxyType(
     {
@@ -31,21 +31,21 @@ USES: Mapping[str, str] = MappingProxyType(
 
 
 def bank_of(seed: int) -> str:
-    """Return what a start is to a policy: `HELD_OUT`, `VALIDATION` or `TRAINING`."""
+    """Return what a start is for a policy: `HELD_OUT`, `VALIDATION` or `TRAINING`."""
     if seed >= names.TEST_SEED:
         return HELD_OUT
     return VALIDATION if seed >= names.VALIDATION_SEED else TRAINING
 
 
 def check_training_starts(seed: int, episodes: int) -> None:
-    """Refuse to demonstrate from starts that are kept to choose by and to count on.
+    """Refuse to demonstrate from starts that are kept for validation or for tests.
 
     Args:
         seed: of the first start.
-        episodes: starts at least, each with the next seed.
+        episodes: least number of starts, each with the next seed.
 
     Raises:
-        InputError: a start is no training start.
+        InputError: a start is not a training start.
     """
     if bank_of(seed + episodes - 1) != TRAINING:
         raise InputError(

@@ -1,7 +1,7 @@
 """Cameras and views by name: ours, registered ones and those of other distributions.
 
 A view is what a policy may see of a camera: its colours, under the camera's name, or its depth. A
-crop of a camera's image is registered, named and asked for as a camera.
+crop of a camera's image is registered, named and requested like a camera.
 """
 
 import zlib
@@ -22,7 +22,7 @@ def _target(name: str) -> str:
 
 
 def _fault(part: object) -> str:
-    """Return what is wrong with what is offered as a camera, "" if nothing."""
+    """Return what is wrong with a part offered as a camera, "" if nothing."""
     if not isinstance(part, type) and callable(getattr(part, "add_to", None)):
         return ""
     return f"is {shown(part)}; it must be a scene.cameras.CameraPose or a scene.cameras.Crop"
@@ -42,7 +42,7 @@ def register_camera(name: str, camera: "Camera", distribution: str = "") -> None
 
     Raises:
         NameCollision: the name is taken.
-        InputError: no camera can be called so, or this is none.
+        InputError: no camera can have this name, or this is not a camera.
     """
     _check_form(name)
     CAMERAS.register(name, camera, distribution)
@@ -60,19 +60,19 @@ def view_names() -> tuple[str, ...]:
 
 
 def check_camera(name: str) -> str:
-    """Return `name` if a camera is called so, else raise `UnknownName`."""
+    """Return `name` if a camera has it, else raise `UnknownName`."""
     return CAMERAS.check(name)
 
 
 def check_view(name: str) -> str:
-    """Return `name` if a view is called so, else raise `UnknownName`."""
+    """Return `name` if a view has it, else raise `UnknownName`."""
     check_name("view", name, view_names())
     CAMERAS.check(names.camera_of(name))
     return name
 
 
 def camera_number(name: str) -> int:
-    """Return a number of the camera's own, the same in every process, for random numbers."""
+    """Return the camera's number, the same in every process, for seeding random numbers."""
     known = name in names.CAMERAS
     return names.CAMERAS.index(name) if known else zlib.crc32(name.encode())
 
@@ -81,7 +81,7 @@ def other_cameras() -> tuple[str, ...]:
     """Return the names of the cameras that are not ours.
 
     Raises:
-        InputError: no camera can be called so.
+        InputError: a name that no camera can have.
     """
     others = camera_names()[len(names.CAMERAS) :]
     for name in others:
@@ -91,7 +91,7 @@ def other_cameras() -> tuple[str, ...]:
 
 
 def _check_form(name: str) -> None:
-    """Refuse names that a LeRobot key or a file of ours would read otherwise."""
+    """Refuse names that would be misread in a LeRobot key or in one of our files."""
     if not name.isidentifier() or name.endswith(("_depth", "_segmentation")):
         raise InputError(
             f"No camera can be called '{name}'; take a name of letters, digits and _ that does "

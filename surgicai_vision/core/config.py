@@ -1,4 +1,4 @@
-"""Configuration: frozen dataclasses, the only schema. Built at the edge, saved beside every result.
+"""Configuration: frozen dataclasses, the only schema. Built at the edge, saved with every result.
 
 `from_mapping` builds a dataclass from plain data (YAML, JSON) and refuses unknown keys with the
 nearest name; `to_mapping` is its inverse; `digest` hashes the canonical JSON. Nothing here is
@@ -44,17 +44,17 @@ STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
 SurgicAI's image evaluation, its RL training script, the trajectories shipped with its release."""
 
 ADVANCES = ("success", "told")
-"""Who takes the whole procedure to its next subtask: the measured success, or whoever acts."""
+"""What moves the whole procedure to its next subtask: the measured success, or whoever acts."""
 DWELL = 15
-"""Control steps a subtask's success must hold, in a whole procedure, before the next one begins."""
+"""Control steps for which a subtask's success must hold in a whole procedure before the next."""
 CLOCK_PERIOD = 25
 """Period of the sine and cosine of `clock` [control steps]."""
 CLOCK_SIZE = 3
 """Length of what `clock` returns."""
 LARGEST_INTEGER = 2**63 - 1
-"""Largest integer of a configuration, as a column of a table holds it; its negative the least."""
+"""Largest integer of a configuration, as in a table's column; the smallest is its negative."""
 LATER: Mapping[str, bool] = types.MappingProxyType({"later": True})
-"""Metadata of a field that its dataclass did not have at first (`to_identity`)."""
+"""Metadata of a field that was added to its dataclass later (`to_identity`)."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class SceneConfig:
             the tip) or "dvrk" (what its motors can give).
         tissue: "channels" (rigid, with open holes, SurgicAI's) or "soft" (pierced anywhere).
         tissue_forces: how soft tissue resists: "phantom", "skin" or "liver".
-        ink: which openings of channels are ringed with ink: all "alike" (SurgicAI's), or the pair
-            that is "due" alone, so that images tell which of several is to be sewn. Soft tissue
-            marks that pair in any case, and takes no other ink.
+        ink: which openings of channels are ringed with ink: all "alike" (SurgicAI's), or only the
+            pair that is "due", so that images show which of several is to be sewn. Soft tissue
+            always marks that pair, and takes no other ink.
     """
 
     layout: str = "simple"
@@ -107,15 +107,15 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class SuccessRule:
-    """What a success of one subtask asks for in learning beyond the paper's; by default nothing.
+    """What a subtask's success requires in learning beyond the paper's; by default nothing.
 
     Attributes:
         steps: control steps for which it must hold; the whole procedure has `DWELL`.
-        tolerance_share: share of the tolerance within which it counts. What stops at the edge has
-            nothing left for a start it never saw.
+        tolerance_share: share of the tolerance within which it counts. A policy that stops at the
+            edge has no margin for a start that it never saw.
         keeps_holes: it counts only while the needle has passed as many holes as at the start. The
-            paper's handoff counts with the needle torn out of the tissue, which no pull-out can
-            then complete.
+            paper's handoff also counts with the needle torn out of the tissue, after which no
+            pullout can succeed.
     """
 
     steps: int = 1
@@ -154,7 +154,7 @@ RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
 )
 """Axis → largest magnitude: beyond it the scene is out of view or the procedure impossible."""
 ANY = "any"
-"""A choice: each episode draws one of all."""
+"""A choice: each episode draws one of all values."""
 NEEDLE_ARCS = ("1/3", "3/8", "1/2")
 """Arcs of surgical needles, as parts of a circle; the scene's own is the first."""
 CHOSEN_ARCS: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
@@ -166,8 +166,8 @@ CHOSEN_ARCS: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
         **{arc: (arc,) for arc in NEEDLE_ARCS},
     }
 )
-"""What `needle_arc` may be → the arcs that it may draw; the one that is held out lies between
-those to train on."""
+"""Value of `needle_arc` → the arcs that it may draw; the held-out arc lies between those for
+training."""
 RANDOMISATION_CHOICES: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
     {
         "pair": ("", ANY),
@@ -175,32 +175,33 @@ RANDOMISATION_CHOICES: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
         "appearance": ("", names.TRAIN, names.HELDOUT, *names.APPEARANCES),
     }
 )
-"""Axis that is a choice → what it may be; "" is off."""
+"""Axis that is a choice → its possible values; "" is off."""
 
 
 @dataclass(frozen=True)
 class RandomisationConfig:
     """Domain randomisation: each axis is drawn uniformly from ± its value for every episode.
 
-    The default of every axis is 0 or "", which is off. What geometry forbids together is refused
-    when an env is made (`envs.feasibility`).
+    The default of every axis is 0 or "", which is off. Combinations that geometry forbids are
+    refused when an env is made (`envs.feasibility`).
 
     Attributes:
         light: brightness of each light, as a fraction of it.
         colour: tint of the tissue and of what surrounds it, as a fraction of each colour channel.
-        camera_shift: place of each camera along each axis [mm]; the endoscope's two move as one.
+        camera_shift: position of each camera along each axis [mm]; the endoscope's two move as one.
         camera_turn: rotation of each camera about each axis [deg].
         camera_fovy: vertical field of view of each camera [deg].
         needle_thickness: fraction of the needle's thickness.
         needle_size: fraction of the radius of the needle's arc, and so of its length.
         friction: fraction of every friction coefficient.
-        phantom_shift: place of the phantom, its holes and goals, in x and y [mm]; a needle that
-            lies on it moves along.
-        kinematic_error: offset of each arm's first three joints that the arm does not know of; 1 is
+        phantom_shift: position of the phantom, its holes and goals, in x and y [mm]; a needle that
+            lies on it moves with it.
+        kinematic_error: offset of each arm's first three joints, unknown to the arm; 1 is
             ±5°, ±5°, ±5 mm, the joint errors of the surgical robotics challenge.
         latency: an action takes effect this many control steps later; the same in every episode.
-        phantom_turn: turn of the phantom about world z [deg]; see `envs.placement` for the axis.
-        robot_start: place of each arm's tip at the start, along each axis of the world [mm].
+        phantom_turn: rotation of the phantom about world z [deg]; see `envs.placement` for the
+            axis.
+        robot_start: position of each arm's tip at the start, along each axis of the world [mm].
         pair: "any" draws the pair of holes to be sewn from all four; "" takes the scene's.
         needle_arc: how much of a circle the needle is: one of `NEEDLE_ARCS`, or "any" of them;
             "train" draws one to train on, a third (in two of three episodes) or a half, "heldout"
@@ -208,10 +209,10 @@ class RandomisationConfig:
         appearance: "train" draws one of the five families of looks for training, "heldout" one of
             those kept for tests, a family's name takes that one; within it every episode has its
             own look. "" takes the plain look. See docs/looks.md.
-        distractors: most things that lie about, 0 to 5: a second needle, gauze, a clip, cut thread,
-            blood. An episode draws how many. They are only seen.
-        appearance_shift: how far the look of each episode is on the way to one of a held-out
-            family, 0 to 1; for tests alone.
+        distractors: largest number of distractor objects, 0 to 5: a second needle, gauze, a clip,
+            cut thread, blood. Each episode draws how many. They are visual only.
+        appearance_shift: how far each episode's look is shifted towards one of a held-out family,
+            0 to 1; for tests only.
     """
 
     light: float = 0.0
@@ -276,12 +277,12 @@ WORLD = RandomisationConfig(
     robot_start=15.0,
 )
 """A world that varies: every geometric axis at its limit. The needle's size is the largest that
-leaves PSM2's jaws room in every pair with a needle of a third of a circle."""
+leaves room for PSM2's jaws in every hole pair, with a needle of a third of a circle."""
 
 
 @dataclass(frozen=True)
 class TaskConfig:
-    """One task in one scene: everything that decides what an episode is.
+    """One task in one scene: everything that defines an episode.
 
     Attributes:
         task: one of `tasks.task_names()`.
@@ -289,16 +290,16 @@ class TaskConfig:
         step: step-size preset, a key of `STEPS`.
         tolerance: "paper" or "released" success tolerances.
         reward: "sparse" (0 on success, else -1), "dense" or "staged" (`envs.base`).
-        max_steps: episode limit [control steps]; 0 takes the task's own: the paper's 200 a subtask,
-            1,000 for the five in a row.
+        max_steps: episode limit [control steps]; 0 takes the task's own: the paper's 200 per
+            subtask, 1,000 for the five in a row.
         randomisation: what differs from episode to episode besides the start; nothing by default.
         action_repeat: control steps that an action is held; the reward is that of the last one.
-        hold_jaw: in a subtask that starts with the needle held the jaw's action is taken as 0, as
-            the released code does in an insertion.
-        end_on_drop: end an episode whose subtask starts with the needle held when it is dropped.
-        advance: how the whole procedure goes on to its next subtask: "success", when the present
-            one's measured success has held for `DWELL` steps, as in the released code, or "told":
-            by `enter` alone, so that nothing the env measures decides which arm moves or lets go.
+        hold_jaw: take the jaw's action as 0, as the released code does in an insertion, in any
+            subtask that starts with the needle held.
+        end_on_drop: in a subtask that starts with the needle held, end the episode if it drops.
+        advance: how the whole procedure moves to its next subtask: "success", once the present
+            one's measured success has held for `DWELL` steps, as in the released code, or "told",
+            only by `enter`, so that nothing the env measures decides which arm moves or lets go.
             A task of one subtask is the same either way.
     """
 
@@ -333,9 +334,9 @@ class TaskConfig:
 
 
 def world_text(env: TaskConfig) -> str:
-    """Return what is not as usual in the world of an env: its scene, and what varies.
+    """Return what is unusual in the world of an env: in its scene, and what varies.
 
-    Each field with its value; "" for the usual scene in which nothing varies.
+    Each field is given with its value; "" is the usual scene in which nothing varies.
     """
     usual = SceneConfig()
     scene = [
@@ -408,10 +409,10 @@ def to_mapping(config: "DataclassInstance") -> dict[str, JSON]:
 
 
 def to_identity(config: "DataclassInstance") -> dict[str, JSON]:
-    """Return a frozen dataclass as the plain data by which it is known.
+    """Return a frozen dataclass as the plain data that identifies it.
 
-    As `to_mapping`, but without the fields, its own and those of dataclasses in it, that are
-    marked `LATER` and have their default: a digest of what does not use them stays what it was.
+    As `to_mapping`, but without the fields, nested ones included, that are marked `LATER` and have
+    their default: the digest of a configuration that does not use them stays the same.
     """
     plain = to_mapping(config)
     for each in dataclasses.fields(config):
@@ -457,7 +458,7 @@ def digest(value: object) -> str:
 
 
 def check_frame_stride(frame_stride: int) -> None:
-    """Raise `InputError` unless `frame_stride` divides the frames a second."""
+    """Raise `InputError` unless `frame_stride` divides the frames per second."""
     if frame_stride < 1 or names.FPS % frame_stride:
         allowed = ", ".join(
             str(number) for number in range(1, names.FPS + 1) if names.FPS % number == 0
@@ -471,10 +472,10 @@ def check_frame_stride(frame_stride: int) -> None:
 def clock(steps: "NDArray[np.int64]") -> "NDArray[np.float32]":
     """Encode the control steps (N,) since a subtask began for a policy, as (N, 3) float32.
 
-    The share of `SUBTASK_STEPS`, and sine and cosine of a hand that goes round once in
-    `CLOCK_PERIOD` steps: the share alone changes too little in a few steps to act by.
+    The values are the share of `SUBTASK_STEPS`, and the sine and cosine of a hand that turns once
+    in `CLOCK_PERIOD` steps: the share alone changes too little in a few steps to act on.
     """
-    import numpy as np  # not above: `--help` reads this module and must be quick
+    import numpy as np  # not at the top: `--help` imports this module and must be quick
 
     turn = 2.0 * np.pi * steps / CLOCK_PERIOD
     return np.stack([steps / SUBTASK_STEPS, np.sin(turn), np.cos(turn)], axis=1).astype(np.float32)

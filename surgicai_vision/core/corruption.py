@@ -1,11 +1,11 @@
-"""Corruption: smoke, blur and noise on an image after it was drawn.
+"""Corruption: smoke, blur and noise on a rendered image.
 
-A corruption is `change(image, strength, moment) -> image` of (height, width, 3) uint8. It is a
-function of the image, the strength, the start seed, the step and the view alone, so an episode
-looks the same in any batch and process. At strength 0 the image comes back as it was.
+A corruption is `change(image, strength, moment) -> image` of (height, width, 3) uint8. It
+depends only on the image, the strength, the start seed, the step and the view, so an episode looks
+the same in any batch and process. At strength 0 the image is unchanged.
 
-Datasets are rendered so (`core.variants`, `render-demos --corruption`), and agents are evaluated
-so (`evaluation.robustness`); the env, its rewards and its films stay clean.
+Datasets can be rendered with it (`core.variants`, `render-demos --corruption`), and agents can be
+evaluated with it (`evaluation.robustness`); the env, its rewards and its films stay clean.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 
 BLUR = 1 / 56
-"""Standard deviation of the blur at strength 1, of the image's height: 4 px at 224."""
+"""Standard deviation of the blur at strength 1, as a share of the image's height: 4 px at 224."""
 NOISE = 64.0
 """Standard deviation of the noise at strength 1 [grey levels of 255]."""
 SMOKE_COLOUR = (196.0, 198.0, 202.0)
@@ -26,7 +26,7 @@ SMOKE_COLOUR = (196.0, 198.0, 202.0)
 SMOKE_THIN, SMOKE_THICK = 0.4, 0.9
 """Opacity of the smoke at strength 1 where it is thinnest and thickest."""
 SMOKE_KNOTS, SMOKE_DRIFT = 5, 1 / 200
-"""Clouds across an image, and their way a control step, of its width: a width in 4 s."""
+"""Clouds across an image, and their drift per control step [image widths]: a width in 4 s."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def noise(image: Image, strength: float, moment: Moment) -> Image:
 
 
 def smoke(image: Image, strength: float, moment: Moment) -> Image:
-    """Return the image behind smoke that drifts; each start and view has clouds of its own."""
+    """Return the image behind drifting smoke; each start and view has its own clouds."""
     height, width = image.shape[:2]
     field = _clouds(moment.seed, moment.view, height, width)
     field = np.roll(field, round(moment.step * SMOKE_DRIFT * width), axis=1)
@@ -66,7 +66,7 @@ def smoke(image: Image, strength: float, moment: Moment) -> Image:
 
 
 def _clouds(seed: int, view: int, height: int, width: int) -> NDArray[np.float32]:
-    """Return smooth noise from 0 to 1, (height, width), that tiles across.
+    """Return smooth noise from 0 to 1, (height, width), that tiles horizontally.
 
     It is bilinear between random knots.
     """
@@ -89,6 +89,6 @@ def _bytes(values: NDArray[np.generic]) -> Image:
 
 
 Change = Callable[[Image, float, Moment], Image]
-"""(image, strength, moment) → the image as it then is."""
+"""(image, strength, moment) → the corrupted image."""
 CORRUPTIONS: Mapping[str, Change] = MappingProxyType({"smoke": smoke, "blur": blur, "noise": noise})
-"""Name → corruption, in the order in which they spoil an image."""
+"""Name → corruption, in the order in which they are applied to an image."""

@@ -13,7 +13,7 @@ from typing import final
 INTERRUPTED = "interrupted; run the same command again"
 """What the command line says after Ctrl-C."""
 SHOWN_BITS = 4096
-"""An integer of more bits is shown by their number: Python refuses to write the longest ones."""
+"""An integer of more bits is shown as its bit count: Python refuses to print the longest ones."""
 
 
 class SurgicaiError(Exception):
@@ -32,7 +32,7 @@ class UnknownName(InputError):
     """A name outside a closed list; the message lists what exists and suggests the nearest.
 
     Args:
-        kind: what the name stands for, in one word ("camera", "encoder").
+        kind: what the name refers to, in one word ("camera", "encoder").
         given: the name as given.
         allowed: every name that exists.
     """
@@ -45,7 +45,7 @@ class UnknownName(InputError):
 
 
 class BadFile(InputError):
-    """A file or folder that is missing, unreadable, damaged or of another kind than asked."""
+    """A file or folder that is missing, unreadable, damaged or of another kind than expected."""
 
 
 class OutputExists(InputError):
@@ -66,7 +66,7 @@ class PhysicsError(SurgicaiError):
 
 @final
 class _Short(reprlib.Repr):
-    """Shows the beginning of a value, however much it holds."""
+    """Shows the beginning of a value, however large it is."""
 
     def __init__(self) -> None:
         super().__init__(maxlevel=2, maxlist=4, maxtuple=4, maxdict=4, maxstring=80, maxother=80)
@@ -81,7 +81,7 @@ _SHORT = _Short()
 
 
 def shown(value: object) -> str:
-    """Return a value of a file as messages show it: its beginning, however much it holds."""
+    """Return a value of a file as messages show it: its beginning, however large it is."""
     return _SHORT.repr(value)
 
 
@@ -99,14 +99,14 @@ def check_name(kind: str, given: str, allowed: Iterable[str]) -> str:
 
 
 def check_at_least(least: int, **numbers: float | None) -> None:
-    """Refuse numbers below `least`; None is no number.
+    """Refuse numbers below `least`; None is skipped.
 
     Args:
-        least: the smallest that is allowed.
-        numbers: what each is called, and its value.
+        least: the smallest allowed value.
+        numbers: the name and the value of each.
 
     Raises:
-        InputError: a number below, or none at all (NaN).
+        InputError: a number below `least`, or NaN.
     """
     for name, number in numbers.items():
         if number is not None and not number >= least:
@@ -114,14 +114,14 @@ def check_at_least(least: int, **numbers: float | None) -> None:
 
 
 def check_at_most(most: int, **numbers: float | None) -> None:
-    """Refuse numbers above `most`; None is no number.
+    """Refuse numbers above `most`; None is skipped.
 
     Args:
-        most: the largest that is allowed.
-        numbers: what each is called, and its value.
+        most: the largest allowed value.
+        numbers: the name and the value of each.
 
     Raises:
-        InputError: a number above, or none at all (NaN).
+        InputError: a number above `most`, or NaN.
     """
     for name, number in numbers.items():
         if number is not None and not number <= most:
@@ -129,13 +129,13 @@ def check_at_most(most: int, **numbers: float | None) -> None:
 
 
 def check_finite(**numbers: float) -> None:
-    """Refuse numbers that are infinite or none at all (NaN).
+    """Refuse numbers that are infinite or NaN.
 
     Args:
-        numbers: what each is called, and its value.
+        numbers: the name and the value of each.
 
     Raises:
-        InputError: such a number.
+        InputError: a number is infinite or NaN.
     """
     for name, number in numbers.items():
         if not math.isfinite(number):
@@ -146,7 +146,7 @@ def check_positive(**numbers: float) -> None:
     """Refuse numbers that are not above 0.
 
     Raises:
-        InputError: a number that is 0, below, or none at all (NaN).
+        InputError: a number that is 0, negative or NaN.
     """
     for name, number in numbers.items():
         if not number > 0:

@@ -25,7 +25,7 @@ from surgicai_vision.core.yaml_text import load_yaml
 CACHE_VARIABLE = "SURGICAI_VISION_CACHE"
 CACHE_HERE = Path("outputs") / "cache"
 TEMPORARY = ".partial-"
-"""Prefix of temporary names; anything so named may be deleted when no process writes."""
+"""Prefix of temporary names; files with it may be deleted while no process writes."""
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -48,7 +48,7 @@ def write_json(path: Path, value: object) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read JSON; `BadFile` where it is missing or damaged."""
+    """Read JSON; raise `BadFile` if it is missing or damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -64,7 +64,7 @@ def read_yaml(path: Path, *, may_be_empty: bool = False) -> dict[str, object]:
 
     Args:
         path: the file.
-        may_be_empty: a file of nothing, or of comments alone, is an empty table.
+        may_be_empty: a file that is empty, or has only comments, is an empty table.
 
     Raises:
         BadFile: the file is missing or damaged, or holds something else.
@@ -87,9 +87,9 @@ def read_yaml(path: Path, *, may_be_empty: bool = False) -> dict[str, object]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, whose file becomes `path` at the end.
+    """Yield a temporary path next to `path`, whose file becomes `path` at the end.
 
-    The folder is made where it is missing; an earlier file is replaced, but not on an error.
+    The folder is created if missing; an earlier file is replaced, but not on an error.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}-{path.name}")
@@ -105,7 +105,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`, renamed to `path` at the end; removed on an error."""
+    """Yield a temporary folder next to `path`, renamed to it at the end; removed on an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}-{path.name}")
     temporary.mkdir()
@@ -127,10 +127,10 @@ def locked(
     Args:
         path: the lock file; its folder exists.
         wait: wait for another holder.
-        refusal: raised where somebody holds it, which then is not waited for.
+        refusal: raised at once, instead of waiting, if another process holds it.
 
     Raises:
-        filelock.Timeout: somebody holds it, `wait` is false, and there is no `refusal`.
+        filelock.Timeout: another process holds it, `wait` is false, and there is no `refusal`.
     """
     with ExitStack() as stack:
         try:
@@ -176,15 +176,15 @@ def check_output(
     """Refuse an output folder that cannot be written or holds other files, before any work.
 
     Args:
-        path: the folder to be made.
-        may_resume: name of a file that marks the folder as one to be continued.
-        option: what the folder was given as, for the message.
-        ours: names of other files that a killed run may leave without the mark; a folder of these
-            alone, and of temporary names of theirs and of the mark's, is as good as an empty one.
+        path: the folder to create.
+        may_resume: name of the marker file of a folder that may be continued.
+        option: the option that gave the folder, for the message.
+        ours: names of other files that a killed run may leave without the marker; a folder with
+            only these, and temporary files of these or of the marker, counts as empty.
 
     Raises:
-        OutputExists: it holds other files, or is one itself.
-        InputError: it cannot be written, or its name is none.
+        OutputExists: it holds other files, or is a file itself.
+        InputError: it cannot be written, or its name is not allowed.
     """
     try:
         _check_output(path, may_resume, option, (*ours, *([may_resume] if may_resume else [])))
@@ -195,7 +195,7 @@ def check_output(
 
 
 def _check_output(path: Path, may_resume: str | None, option: str, ours: Collection[str]) -> None:
-    """Do `check_output`; a system that does not tell raises OSError."""
+    """Do `check_output`; raise OSError if the system cannot check the path."""
     if path.exists():
         if not path.is_dir():
             raise OutputExists(f"{option} {path} is a file; give a folder that does not exist yet.")
@@ -214,13 +214,13 @@ def _check_output(path: Path, may_resume: str | None, option: str, ours: Collect
 
 
 def _is_left(name: str, ours: Collection[str]) -> bool:
-    """Return True if a file is one of `ours`, or what was to become one when a run was killed."""
+    """Return True if a file is one of `ours`, or was to become one when a run was killed."""
     temporary = name.startswith(TEMPORARY) and name.endswith(tuple(f"-{one}" for one in ours))
     return name in ours or temporary
 
 
 def remove_partial(folder: Path, ours: Collection[str]) -> None:
-    """Remove temporary files that killed runs left in a folder and nobody writes any more.
+    """Remove temporary files that killed runs left in a folder, which no process still writes.
 
     Args:
         folder: the folder.
@@ -235,12 +235,12 @@ def claim(path: Path, owner: Mapping[str, object], what: str) -> None:
     """Record in the file `path` what its folder belongs to; refuse a folder of something else.
 
     Args:
-        path: a file in the folder, which is made.
+        path: a file in the folder, which is created.
         owner: everything that the folder's content depends on, as plain data.
         what: what the folder holds, for the message.
 
     Raises:
-        OutputExists: the file is there and says something else.
+        OutputExists: the file exists and says something else.
     """
     if path.exists() and read_json(path) != owner:
         raise OutputExists(
@@ -259,12 +259,12 @@ def sha256_file(path: Path) -> str:
 PACKAGE = Path(__file__).parent.parent
 """The package `surgicai_vision`."""
 FAMILIES = ("encoders", "policies")
-"""Packages beside this one whose sources decide results."""
+"""Packages next to this one whose sources decide results."""
 SHARED = tuple(
     PACKAGE / "core" / f"{name}.py"
     for name in ("cameras", "config", "corruption", "names", "runs", "tasks", "variants", "video")
 )
-"""Modules of `core` whose sources decide results, of whichever stage."""
+"""Modules of `core` whose sources decide results, in every stage."""
 
 
 @functools.cache
@@ -273,8 +273,8 @@ def code_version(*stages: str) -> str:
 
     Args:
         stages: only these stages ("envs", "demos", …) and the shared modules; none means all of
-            them. The families "encoders" and "policies" stand beside the package and are named to
-            be counted.
+            them. The families "encoders" and "policies" are next to the package and count only if
+            named.
     """
     package = PACKAGE
     digest = hashlib.sha256()
@@ -293,8 +293,8 @@ def code_version(*stages: str) -> str:
 def cache_root() -> Path:
     """Return $SURGICAI_VISION_CACHE, or ~/.cache/surgicai-vision.
 
-    Where the home folder cannot be written, or there is none, as for some users of a container, it
-    is `outputs/cache` in the current folder.
+    If there is no home folder that can be written, as for some users of a container, it is
+    `outputs/cache` in the current folder.
     """
     given = os.environ.get(CACHE_VARIABLE)
     if given:

@@ -1,4 +1,4 @@
-"""The Hugging Face Hub's client, with every refusal in one line."""
+"""Client of the Hugging Face Hub, with every refusal in one line."""
 
 import os
 import socket
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
 CONNECT_SECONDS = 3.0
-"""How long the Hub may take to answer before it counts as out of reach."""
+"""How long the Hub may take to answer before it counts as unreachable."""
 
 
 def connect(repo: str, api: "HfApi | None" = None) -> "HfApi":
@@ -22,7 +22,7 @@ def connect(repo: str, api: "HfApi | None" = None) -> "HfApi":
 
     Args:
         repo: "user/name".
-        api: a client that is taken as it is; made here by default.
+        api: a client to use as it is; created here by default.
 
     Raises:
         InputError: a bad name.
@@ -54,7 +54,7 @@ def connect(repo: str, api: "HfApi | None" = None) -> "HfApi":
 
 
 def reach(endpoint: str) -> None:
-    """Raise `SurgicaiError` at once where the Hub or the proxy before it does not answer."""
+    """Raise `SurgicaiError` at once if the Hub, or the proxy in front of it, does not answer."""
     wanted = urllib.parse.urlsplit(endpoint)
     proxy = urllib.request.getproxies().get(wanted.scheme)
     target = urllib.parse.urlsplit(proxy) if proxy else wanted
@@ -70,7 +70,7 @@ def reach(endpoint: str) -> None:
 
 @contextmanager
 def refusals_in_one_line(repo: str) -> Iterator[None]:
-    """Raise what the Hub refuses as a `SurgicaiError` of one line."""
+    """Raise refusals of the Hub as a `SurgicaiError` of one line."""
     import httpx
     from huggingface_hub.errors import HfHubHTTPError
 

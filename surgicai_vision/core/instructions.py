@@ -1,12 +1,12 @@
 """Instructions: each task in several sentences, for policies that read language.
 
 * `instructions(task, bank)`: the sentences of a bank: "standard" (the one that datasets store),
-  "train" (it and its paraphrases for training), "heldout" (paraphrases for tests alone).
+  "train" (it and its paraphrases for training), "heldout" (paraphrases for tests only).
 * `draw_instruction(task, bank, seed)`: one of them, by an episode's seed.
 
 A paraphrase names the same goal, arm and part of the needle as the standard sentence. LIBERO-like
-benchmarks give one sentence a task, so that a policy may read a task's number out of it; held-out
-sentences say whether it reads. A task of another distribution has its own sentence alone.
+benchmarks give one sentence per task, which a policy may use as a task number; held-out sentences
+show whether it reads the text. A task of another distribution has only its own sentence.
 """
 
 from collections.abc import Mapping
@@ -93,14 +93,14 @@ PARAPHRASES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = MappingProx
         ),
     }
 )
-"""Task → its paraphrases for training, and those for tests alone; ours, written for this."""
+"""Task → its paraphrases for training, and those for tests only; written for this project."""
 
 
 def instructions(task: str, bank: str = STANDARD) -> tuple[str, ...]:
     """Return the sentences of a task.
 
     Raises:
-        UnknownName: another bank, or no such task.
+        UnknownName: no such bank, or no such task.
     """
     check_name("bank of instructions", bank, INSTRUCTION_BANKS)
     standard = (task_text(task),)

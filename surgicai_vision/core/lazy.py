@@ -1,7 +1,7 @@
-"""Lazy mapping: values that are made when they are first looked at, such as rendered images.
+"""Lazy mapping: values that are computed on first access, such as rendered images.
 
-A policy over several others sees two of eight views in most steps; an observation of this kind
-costs what is looked at.
+A policy over several others reads two of eight views in most steps; with such an observation it
+pays only for those.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -10,11 +10,11 @@ from typing import final
 
 @final
 class LazyMapping[T](Mapping[str, T]):
-    """Values by key, each made once and then kept.
+    """Values by key, each computed once and then kept.
 
     Args:
-        makers: key → what makes its value, when it is first asked for.
-        ready: values that are there already.
+        makers: key → function that computes its value, called on first access.
+        ready: values that exist already.
     """
 
     def __init__(self, makers: Mapping[str, Callable[[], T]], ready: Mapping[str, T]) -> None:
@@ -22,13 +22,13 @@ class LazyMapping[T](Mapping[str, T]):
         self._values = dict(ready)
 
     def __getitem__(self, key: str) -> T:
-        """Return a value; it is made now if it is asked for the first time."""
+        """Return a value; compute it on first access."""
         if key not in self._values:
             self._values[key] = self._makers[key]()
         return self._values[key]
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the keys; none of their values is made."""
+        """Yield the keys, without computing values."""
         return iter({**self._makers, **self._values})
 
     def __len__(self) -> int:
@@ -36,5 +36,5 @@ class LazyMapping[T](Mapping[str, T]):
         return len({**self._makers, **self._values})
 
     def __contains__(self, key: object) -> bool:
-        """Return True for a key, whose value is not made."""
+        """Return True for a key, without computing its value."""
         return key in self._makers or key in self._values

@@ -1,6 +1,6 @@
-"""Every name that crosses a module border, once: tasks, arms, cameras, modalities, dataset keys.
+"""Every name that several modules use, once: tasks, arms, cameras, modalities, dataset keys.
 
-Other modules import these and never spell them. Names are the field's: gymnasium, LeRobot, dVRK.
+Other modules import these and never spell them out. Names follow gymnasium, LeRobot and dVRK.
 """
 
 from types import MappingProxyType
@@ -51,8 +51,7 @@ CROPS = (
 CAMERAS = (*FIXED_CAMERAS, *WRIST_CAMERAS, *CROPS[:4], *ENDOSCOPE_CAMERAS, *CROPS[4:])
 """Our cameras and crops; `core.cameras` knows those of other distributions too, and every view.
 
-A place in this tuple is a number of the camera's own (`core.cameras.camera_number`): append new
-ones.
+The index in this tuple is the camera's number (`core.cameras.camera_number`): append new ones.
 """
 RGB = "rgb"
 DEPTH = "depth"
@@ -62,7 +61,7 @@ PARTS = ("background", "phantom", "needle", "thread", "psm1", "psm2")
 """Named parts; a part's index is its value in a segmentation image."""
 
 APPEARANCES = ("silicone", "mucosa", "skin", "muscle", "fat", "liver", "bowel", "scar")
-"""Families of looks (`scene.visual.families`). A state holds a family's place here: only append."""
+"""Families of looks (`scene.visual.families`). A state holds a family's index here: only append."""
 HELDOUT_APPEARANCES = ("liver", "bowel", "scar")
 """Families that no training may see."""
 TRAIN_APPEARANCES = tuple(name for name in APPEARANCES if name not in HELDOUT_APPEARANCES)
@@ -99,7 +98,7 @@ _POSE_NAMES = (
 ABSOLUTE_STATE_NAMES = tuple(
     name for arm in ARMS for name in (*(f"{arm}_pose.{part}" for part in _POSE_NAMES), f"{arm}_jaw")
 )
-"""Elements of `envs.absolute.measured`, called as in Open-H-Embodiment (`dataset.open_h`)."""
+"""Elements of `envs.absolute.measured`, named as in Open-H-Embodiment (`dataset.open_h`)."""
 ABSOLUTE_ACTION_NAMES = tuple(
     name
     for arm in ARMS
@@ -133,18 +132,18 @@ BOTH_ARMS = "both_arms"
 SETPOINT = "setpoint"
 """How far the active arm's set point lies from its measured tip pose and jaw."""
 PRIVILEGED_STATE = "privileged_state"
-"""The 21 values of obs_type "state" with the goal; no LeRobot key, lest a policy be fed it."""
+"""The 21 values of obs_type "state" with the goal; not a LeRobot key, so no policy is fed it."""
 
 RELATIVE_STATE = "relative_state"
-"""The 24 values of obs_type "relative" with the goal; in no dataset, the env says it."""
+"""The 24 values of obs_type "relative" with the goal; in no dataset, the env provides it."""
 
 STATES_WITH_GOAL = (PRIVILEGED_STATE, RELATIVE_STATE)
-"""What no policy with images may be fed."""
+"""What no image policy may be fed."""
 
 CLOCK = "clock"
-"""The time since the subtask began as `config.clock` tells it; computed, in no dataset."""
+"""The time since the subtask began, encoded by `config.clock`; computed, in no dataset."""
 PROGRESS = "progress"
-"""The progress of the subtask as another policy says it (`training.progress_input`)."""
+"""The progress of the subtask as another policy predicts it (`training.progress_input`)."""
 STAGE = "stage"
 """The subtask that is due and the progress within the present one (`training.visits.stages`)."""
 ACTION_CHUNK = "action_chunk"
@@ -157,7 +156,7 @@ INFO_FILE = "meta/info.json"
 """What makes a folder a LeRobot dataset, whoever wrote it."""
 
 CALIBRATION = "calibration."
-"""Beginning of the keys of a view's nominal K and T_world_camera, which are no policy's input."""
+"""Prefix of the keys of a view's nominal K and T_world_camera, which are no policy's input."""
 
 FPS = 50
 """Control steps and frames per second of simulated time."""
@@ -165,7 +164,7 @@ FPS = 50
 TRAIN_SEED = 0
 VALIDATION_SEED = 500_000
 TEST_SEED = 900_000
-"""First seed of each bank of start states; the banks never meet (fewer than 400,000 seeds each)."""
+"""First seed of each bank of start states; the banks never overlap (under 400,000 seeds each)."""
 
 
 def camera_of(view: str) -> str:

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from surgicai_vision.core import names
 
 MAX_CATCH_UP_TICKS = 5
-"""Ticks that may be caught up; those beyond are dropped, since nobody can steer a burst."""
+"""Ticks that may be caught up; further ones are dropped, since nobody can steer a burst."""
 MAX_TICKS_WITHOUT_IMAGE = 10
-"""Ticks after which an image is due even when late: five a second at real time."""
+"""Ticks after which an image is due even when late: five per second at real time."""
 
 MEMORY_TICKS = 25
-"""Ticks over which the pace that was reached is averaged."""
+"""Ticks over which the achieved pace is averaged."""
 
 
 class Pacer:
@@ -20,7 +20,7 @@ class Pacer:
     Args:
         pace: share of real time; 0.5 is half speed.
         clock: returns monotonic seconds.
-        sleep: waits so many seconds.
+        sleep: waits the given number of seconds.
         patience: ticks after which an image is due even when late.
     """
 
@@ -67,5 +67,5 @@ class Pacer:
 
     @property
     def reached(self) -> float:
-        """Return the share of real time at which the last ticks really went."""
+        """Return the share of real time that the last ticks achieved."""
         return 1.0 / (names.FPS * max(self._length, 1e-6))

@@ -1,6 +1,6 @@
 """Plug-ins: the parts of the toolkit by name, ours and those of other distributions.
 
-A registry knows its parts from three places, in this order:
+A registry gets its parts from three places, in this order:
 
 1. the table of this distribution, "module:attribute" by name, imported on first use;
 2. `register(name, part)`, called by whoever imports this package;
@@ -10,8 +10,8 @@ A registry knows its parts from three places, in this order:
        [project.entry-points."surgicai_vision.encoders"]
        my-encoder = "my_package.my_encoder:PLUGIN"
 
-Two parts of one name are refused with an error that names both distributions. So is a part that is
-no such thing as its kind asks for, and whatever a part's own code raises names it and its
+Two parts with one name are refused with an error that names both distributions. A part that is not
+of the registry's kind is refused too, and an error from a part's own code names the part and its
 distribution (`Registry.calling`).
 
     ENCODERS = Registry[Plugin](
@@ -63,7 +63,7 @@ class NameCollision(InputError):
 
 
 def instance_of(target: str) -> Fault:
-    """Return the fault of what is no instance of the class "module:Class"."""
+    """Return a function that finds the fault of a part that is no instance of "module:Class"."""
 
     def fault(part: object) -> str:
         if isinstance(part, resolve(target)):
@@ -74,7 +74,7 @@ def instance_of(target: str) -> Fault:
 
 
 def subclass_of(target: str) -> Fault:
-    """Return the fault of what is no class of its own below the class "module:Class"."""
+    """Return a function that finds the fault of what is no concrete subclass of "module:Class"."""
 
     def fault(part: object) -> str:
         if not isinstance(part, type) or not issubclass(part, resolve(target)):
@@ -88,18 +88,18 @@ def subclass_of(target: str) -> Fault:
 
 
 def uncallable(part: object, name: str) -> str:
-    """Return the fault of a part whose attribute `name` is no function; "" of one that is."""
+    """Return the fault of a part whose attribute `name` is not callable; "" if it is."""
     value: object = getattr(part, name)
     return "" if callable(value) else f"has a {name} that is {shown(value)}; it must be a function"
 
 
 def _fits(part: object) -> str:
-    """Find no fault in anything."""
+    """Return "", no fault, for any part."""
     return ""
 
 
 def _public(target: str) -> str:
-    """Return the name of a class as a page of the reference has it."""
+    """Return the name of a class as the reference pages write it."""
     return target.replace(":", ".")
 
 
@@ -111,7 +111,7 @@ class Registry[Part]:
         kind: what a part is, in one word ("encoder"), for messages.
         group: entry-point group in which other distributions offer parts of this kind.
         ours: name → "module:attribute" of the parts of this distribution.
-        fault: what is wrong with a part of another distribution, or one that is registered.
+        fault: finds what is wrong with a part that is registered or from another distribution.
     """
 
     def __init__(self, kind: str, group: str, ours: Mapping[str, str], fault: Fault = _fits):
@@ -128,16 +128,16 @@ class Registry[Part]:
     def names(self) -> tuple[str, ...]:
         """Return every name: ours, then registered ones, then those of installed distributions.
 
-        A name that two distributions offer is there as well; only its use is refused.
+        A name that two distributions offer is included as well; only its use is refused.
         """
         self._search()
         return tuple(self._targets)
 
     def check(self, name: str) -> str:
-        """Return `name` if a part is called so; imports no part.
+        """Return `name` if a part has it; import no part.
 
         Raises:
-            UnknownName: no part is called so.
+            UnknownName: no part has this name.
             NameCollision: two distributions offer one.
         """
         check_name(self.kind, name, self.names())
@@ -149,9 +149,9 @@ class Registry[Part]:
         """Return the part called `name`, imported on first use.
 
         Raises:
-            UnknownName: no part is called so.
+            UnknownName: no part has this name.
             NameCollision: two distributions offer one.
-            InputError: another distribution's part cannot be imported, or is no such part.
+            InputError: another distribution's part cannot be imported, or is not of this kind.
         """
         self.check(name)
         distribution, load = self._targets[name]
@@ -159,7 +159,7 @@ class Registry[Part]:
             return cast(Part, load())
         try:
             part = load()
-        except Exception as error:  # a module of other people's may raise anything
+        except Exception as error:  # a third-party module may raise anything
             raise self.refusal(name, f"cannot be imported: {_reason(error)}") from error
         return self._checked(name, distribution, part)
 
@@ -173,7 +173,7 @@ class Registry[Part]:
 
         Raises:
             NameCollision: the name is taken.
-            InputError: this is no such part.
+            InputError: the part is not of this kind.
         """
         self._search()
         owner = distribution or f"register_{self.kind}()"
@@ -181,7 +181,7 @@ class Registry[Part]:
         self._add(name, owner, lambda: part)
 
     def unregister(self, name: str) -> None:
-        """Forget the part called `name`; for tests of parts that are registered in them."""
+        """Forget the part called `name`; for tests that register parts."""
         self._targets.pop(name, None)
 
     def owner(self, name: str) -> str:
@@ -194,11 +194,11 @@ class Registry[Part]:
         return self.distribution(name) == DISTRIBUTION
 
     def distribution(self, name: str) -> str:
-        """Return the first distribution that offers `name`, and ours for a name of no table."""
+        """Return the first distribution that offers `name`; ours for an unknown name."""
         return self._targets[name][0] if name in self._targets else DISTRIBUTION
 
     def refusal(self, name: str, reason: str) -> InputError:
-        """Return the error that says of a part, by name and distribution, why it cannot be used.
+        """Return the error that names a part and its distribution and says why it is unusable.
 
         Args:
             name: of the part.
@@ -208,10 +208,10 @@ class Registry[Part]:
 
     @contextmanager
     def calling(self, name: str) -> Iterator[None]:
-        """Let an error of the part's own code, which runs within, say whose it is.
+        """Let an error of the part's own code, which runs in the block, name the part.
 
-        Errors of this product keep their kind, and the part's name is put before them; any other
-        becomes an `InputError`, with its traceback as a note. Our own parts' errors stay as they
+        Errors of this product keep their type and get the part's name as a prefix; any other
+        becomes an `InputError`, with its traceback as a note. Errors of our own parts stay as they
         are.
 
         Args:
@@ -223,7 +223,7 @@ class Registry[Part]:
             if not self.is_ours(name):
                 error.args = (f"{self._title(name)}: {error}",)
             raise
-        except Exception as error:  # code of other people's may raise anything
+        except Exception as error:  # third-party code may raise anything
             if self.is_ours(name):
                 raise
             refusal = self.refusal(name, f"failed: {_reason(error)}")
@@ -231,17 +231,17 @@ class Registry[Part]:
             raise refusal from error
 
     def _checked(self, name: str, owner: str, part: object) -> Part:
-        """Return what is offered as a part, or refuse it."""
+        """Return `part` if it is of this kind, else refuse it."""
         if fault := self._fault(part):
             raise InputError(f"{self._title(name, owner)} {fault}.")
         return cast(Part, part)
 
     def _title(self, name: str, owner: str = "") -> str:
-        """Return how a message calls a part."""
+        """Return how a message names a part."""
         return f"The {self.kind} '{name}' of '{owner or self.distribution(name)}'"
 
     def _search(self) -> None:
-        """Read the entry points of the group, once; note names that are taken."""
+        """Read the entry points of the group, once; record name collisions."""
         if self._is_searched:
             return
         self._is_searched = True
@@ -260,7 +260,7 @@ class Registry[Part]:
 @functools.cache
 def _installed(path: tuple[str, ...]) -> "EntryPoints":
     """Return the entry points of every distribution on `path`, which is `sys.path`."""
-    from importlib.metadata import entry_points  # not above: it is most of what a start takes
+    from importlib.metadata import entry_points  # not at the top: it is most of the start-up time
 
     return entry_points()
 
@@ -271,7 +271,7 @@ def _owner(point: "EntryPoint") -> str:
 
 
 def _reason(error: Exception) -> str:
-    """Return an error of other people's code in a line: its kind, its text and where it arose."""
+    """Return an error of third-party code in one line: its type, its text and where it arose."""
     said = first_line(error).removesuffix(".")
     if isinstance(error, SurgicaiError | ImportError):
         return said

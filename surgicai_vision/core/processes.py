@@ -1,16 +1,16 @@
 """Processes: the one way in which this package starts others.
 
 Children are spawned, since a fork would copy a GL context and torch's threads. A child ends with
-the process that started it, whatever ended that one: a thread of the child looks twice a second
-whether its parent is still there. Grandchildren do the same, so a killed run leaves nothing alive
+the process that started it, however that one ended: a thread of the child checks twice a second
+whether its parent still exists. Grandchildren do the same, so a killed run leaves nothing alive
 after about a second. (Linux can send a signal on a parent's death, but it sends it on the death of
 the *thread* that started the child.)
 
 Three kinds:
 
-* `Child`: a function at the other end of a pipe, for as long as it likes.
-* `Worker`: a child that does one call after the other; `run_all` does several calls at once.
-* `run_module`, `start_module`: a Python module as a program of its own.
+* `Child`: a function at the other end of a pipe, for as long as it runs.
+* `Worker`: a child that does one call after another; `run_all` does several calls at once.
+* `run_module`, `start_module`: a Python module as a separate program.
 """
 
 import atexit
@@ -39,7 +39,7 @@ ONE_THREAD: Mapping[str, str] = MappingProxyType(
     {"LP_NUM_THREADS": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 )
 """Environment of a child that has a core to itself: the threads of llvmpipe and the BLAS would
-fight over it (measured: two single-threaded processes scale linearly)."""
+compete for it (measured: two single-threaded processes scale linearly)."""
 
 OFFLINE: Mapping[str, str] = MappingProxyType({"HF_HUB_OFFLINE": "1"})
 """Environment of a child that must find all it needs on this machine."""
@@ -47,10 +47,10 @@ OFFLINE: Mapping[str, str] = MappingProxyType({"HF_HUB_OFFLINE": "1"})
 
 @contextmanager
 def kept_schedule() -> Iterator[None]:
-    """Leave this thread's scheduling as it is found.
+    """Restore this thread's scheduling at the end.
 
-    SVT-AV1 makes the thread that opens it a real-time one (SCHED_FIFO, priority 99) where it runs
-    as root: all that the process does from then on would stop everything else on its core.
+    As root, SVT-AV1 makes the thread that opens it a real-time one (SCHED_FIFO, priority 99): all
+    that the process does from then on would stop everything else on its core.
     """
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
@@ -62,10 +62,10 @@ def kept_schedule() -> Iterator[None]:
 T = TypeVar("T")
 
 WATCH_S = 0.5
-"""How often a child looks for its parent [s]."""
+"""Interval at which a child looks for its parent [s]."""
 
 PATIENCE_S = 10.0
-"""How long a dismissed child may take to leave before it is killed [s]."""
+"""How long a dismissed child may take to exit before it is killed [s]."""
 
 
 REPORT_S = 0.1
@@ -89,10 +89,10 @@ def raise_on_terminate() -> None:
 
 @contextmanager
 def _termination_waits() -> Iterator[None]:
-    """Handle a SIGTERM or a Ctrl-C that arrives inside only afterwards.
+    """Delay a SIGTERM or a Ctrl-C that arrives inside until the end.
 
-    A child that is started reads from a pipe what it is to do; broken off halfway it would show a
-    traceback beside our one line.
+    A starting child reads its instructions from a pipe; interrupted halfway, it would print a
+    traceback in addition to our one line.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # the signals arrive in the main thread, which is elsewhere
@@ -113,7 +113,7 @@ def _termination_waits() -> Iterator[None]:
 
 
 def end_with_parent(parent: int) -> None:
-    """Let this process end as soon as `parent` is no longer the one that it belongs to."""
+    """Let this process end as soon as `parent` is no longer its parent."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -205,9 +205,9 @@ class Child:
         """Start a child.
 
         Args:
-            serve: called in the child as `serve(connection, *arguments)`; a function of a module.
+            serve: called in the child as `serve(connection, *arguments)`; module-level.
             arguments: picklable, or shared memory of multiprocessing.
-            variables: environment variables of the child besides those of this process.
+            variables: environment variables of the child, in addition to this process's.
         """
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
@@ -229,11 +229,11 @@ class Child:
         return self._process.exitcode
 
     def join(self) -> None:
-        """Wait a while for a child that is about to leave."""
+        """Wait a while for a child that is about to exit."""
         self._process.join(PATIENCE_S)
 
     def dismiss(self) -> None:
-        """Close the pipe and let the child leave in order (it frees its GL context), or kill it."""
+        """Close the pipe and let the child exit cleanly (it frees its GL context), or kill it."""
         self.connection.close()
         self.join()
         self.end()
@@ -248,7 +248,7 @@ class Child:
 
 @atexit.register
 def _end_children() -> None:
-    """End the children that nobody ended, which multiprocessing would wait for."""
+    """End the remaining children, which multiprocessing would wait for."""
     for child in list(_children):
         child.end()
 
@@ -267,17 +267,17 @@ class _ParentWatch:
 def _live(
     _: None, connection: Connection, serve: Callable[..., None], arguments: tuple[object, ...]
 ) -> None:
-    """Serve one end of a pipe; Ctrl-C is the parent's to handle."""
+    """Serve one end of a pipe; the parent handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with connection, suppress(EOFError, BrokenPipeError, ConnectionResetError):
         serve(connection, *arguments)
 
 
 class Report(Protocol):
-    """Tells how far a call is."""
+    """Reports the progress of a call."""
 
     def __call__(self, value: int, /) -> None:
-        """Hear or send a number."""
+        """Receive or send a number."""
 
 
 @dataclass(frozen=True)
@@ -289,14 +289,14 @@ class Done:
 
 @dataclass(frozen=True)
 class _Reported:
-    """How far a call is."""
+    """The progress of a call."""
 
     value: int
 
 
 @final
 class Worker:
-    """A child that does one call after the other.
+    """A child that does one call after another.
 
     Attributes:
         connection: readable when there is something to receive, or the child is dead.
@@ -310,15 +310,15 @@ class Worker:
     def call(
         self, function: Callable[..., object], *arguments: object, hear: Report | None = None
     ) -> None:
-        """Hand it a call.
+        """Send the child a call.
 
         Args:
-            function: a function of a module, or a partial of one.
+            function: a module-level function, or a partial of one.
             arguments: its arguments, picklable.
-            hear: is told what the function reports; it gets `report=` for that.
+            hear: receives what the function reports; the function gets `report=` for that.
         """
         self._hear = hear
-        with suppress(OSError):  # dead already: `receive` says so
+        with suppress(OSError):  # already dead: `receive` says so
             self.connection.send((function, arguments, hear is not None))
 
     def receive(self) -> Done | Failure | None:
@@ -339,7 +339,7 @@ class Worker:
         return message
 
     def dismiss(self) -> None:
-        """Let an idle child leave in order."""
+        """Let an idle child exit cleanly."""
         self._child.dismiss()
 
     def end(self) -> None:
@@ -363,7 +363,7 @@ def _serve_calls(connection: Connection) -> None:
 
 
 def _sender(connection: Connection) -> Report:
-    """Return a function that sends numbers, a few a second at most."""
+    """Return a function that sends numbers, at most a few per second."""
     last = time.monotonic()
 
     def report(value: int) -> None:
@@ -381,12 +381,12 @@ def run_all(
     hear: Callable[[Sequence[int]], None],
     variables: Mapping[str, str] = ONE_THREAD,
 ) -> list[T]:
-    """Do each call in a worker of its own, all at once; return what they return, in order.
+    """Do each call in its own worker, all at once; return what they return, in order.
 
     Args:
-        calls: functions of modules or partials of them; each gets `report=`, for how far it is.
+        calls: module-level functions or partials of them; each gets `report=` for its progress.
         what: what is done, for the message about an unexpected failure.
-        hear: is told what each call reported last.
+        hear: receives what each call reported last.
         variables: environment variables of the workers.
 
     Raises:

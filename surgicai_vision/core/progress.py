@@ -1,4 +1,4 @@
-"""Progress: how work tells how far it is."""
+"""Progress: how work reports its progress."""
 
 import time
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Tells how far it is: `progress(done, total)` or `progress(done, total, unit)`."""
+    """Reports progress: `progress(done, total)` or `progress(done, total, unit)`."""
 
     def __call__(self, done: int, total: int, unit: str = ..., /) -> None:
         """Show how much is done."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 
 def runs_of(values: NDArray[np.generic]) -> list[tuple[int, int]]:
-    """Return (first place, place after the last) of every run of equal values in `values`, (N,)."""
+    """Return (first index, index after the last) of every run of equal values in `values`, (N,)."""
     count = len(values)
     edges = np.flatnonzero(values[1:] != values[:-1]) + 1
     return list(itertools.pairwise([0, *edges.tolist(), count])) if count else []

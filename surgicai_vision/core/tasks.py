@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 SUBTASK_STEPS: Final = 200
 """Control steps a subtask may take (paper, image policies)."""
 NEEDED: Final = ("name", "arm", "tolerances", "demands")
-"""What a task's class has of its own."""
+"""Attributes that a task's class must define."""
 _is_subtask = subclass_of("surgicai_vision.envs.subtask:Subtask")
 
 
 def _fault(part: object) -> str:
-    """Return what is wrong with what is offered as a task, "" if nothing."""
+    """Return what is wrong with a part offered as a task, "" if nothing."""
     if fault := _is_subtask(part):
         return fault
     subtask = cast("type[Subtask]", part)
@@ -60,7 +60,7 @@ TASKS: Final = Registry["type[Subtask]"](
     },
     _fault,
 )
-"""Task name → its subclass of `envs.subtask.Subtask`; of `suture`, the env of all five."""
+"""Task name → its subclass of `envs.subtask.Subtask`; for `suture`, the env of all five."""
 
 
 def task_names() -> tuple[str, ...]:
@@ -69,7 +69,7 @@ def task_names() -> tuple[str, ...]:
 
 
 def check_task(name: str) -> str:
-    """Return `name` if a task is called so, else raise `UnknownName`; imports no task."""
+    """Return `name` if a task has it, else raise `UnknownName`; import no task."""
     return TASKS.check(name)
 
 
@@ -77,9 +77,9 @@ def load_subtask(name: str) -> "type[Subtask]":
     """Return the class of a task that is one subtask.
 
     Raises:
-        UnknownName: no task is called so.
-        InputError: another distribution's task cannot be imported, lacks something or is called
-            otherwise.
+        UnknownName: no task has this name.
+        InputError: another distribution's task cannot be imported, lacks something or has another
+            name.
     """
     subtask = TASKS.load(name)
     if subtask.name != name:
@@ -97,7 +97,7 @@ def task_text(name: str) -> str:
 
 
 def task_steps(name: str) -> int:
-    """Return the control steps an episode of a task may take unless it is said."""
+    """Return the control steps that an episode of a task may take by default."""
     if name == names.SUTURE:
         return SUBTASK_STEPS * len(names.SUBTASKS)
     return SUBTASK_STEPS if name in names.SUBTASKS else load_subtask(name).max_steps
@@ -113,7 +113,7 @@ def register_task(subtask: "type[Subtask]", distribution: str = "") -> None:
 
     Raises:
         NameCollision: the name is taken.
-        InputError: this is no task, or it lacks something.
+        InputError: this is not a task, or it lacks something.
     """
     TASKS.register(getattr(subtask, "name", shown(subtask)), subtask, distribution)
     register_ids()
@@ -122,7 +122,7 @@ def register_task(subtask: "type[Subtask]", distribution: str = "") -> None:
 def register_ids() -> None:
     """Register every task's gymnasium id, as soon as gymnasium is imported.
 
-    gymnasium has no entry points, and importing it costs a third of what `--help` may take.
+    gymnasium has no entry points, and importing it costs a third of the time `--help` may take.
     """
     if "gymnasium" in sys.modules:
         _register_all()
@@ -131,7 +131,7 @@ def register_ids() -> None:
 
 
 class _GymnasiumFinder(MetaPathFinder):
-    """Finds gymnasium as Python does, once, and has the ids registered when it was imported."""
+    """Finds gymnasium once, as Python does, and registers the ids when it has been imported."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None

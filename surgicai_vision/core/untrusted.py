@@ -1,4 +1,4 @@
-"""Plain data of others: text → JSON, and JSON → the types that its reader needs; else `BadFile`.
+"""Untrusted plain data: text → JSON, and JSON → the types that a reader needs; else `BadFile`.
 
     row = checked(parse_json(line, where), dict, where)
     fps = finite_number(row.get("fps"), f"{where}: fps")
@@ -17,7 +17,7 @@ from surgicai_vision.core.errors import BadFile, shown
 KINDS: Mapping[type, str] = MappingProxyType(
     {dict: "a table of keys", list: "a list", str: "text", int: "a whole number"}
 )
-"""Type → how messages call it."""
+"""Type → its name in messages."""
 
 
 def parse_json(text: str, where: str) -> JSON:
@@ -25,10 +25,10 @@ def parse_json(text: str, where: str) -> JSON:
 
     Args:
         text: one value of JSON.
-        where: where the text stands, for the message.
+        where: where the text is from, for the message.
 
     Raises:
-        BadFile: it is none, or is nested too deeply.
+        BadFile: it is not JSON, or is nested too deeply.
     """
     try:
         value: JSON = json.loads(text)
@@ -63,7 +63,7 @@ def finite_number(value: object, where: str) -> float:
         where: the file and the place in it, for the message.
 
     Raises:
-        BadFile: it is none, or too large for one.
+        BadFile: it is not a finite number, or too large for one.
     """
     try:
         if isinstance(value, int | float) and math.isfinite(value):

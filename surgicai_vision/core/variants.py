@@ -22,10 +22,10 @@ class Variants:
     """The looks in which each demonstration is rendered.
 
     Attributes:
-        appearance: of `RandomisationConfig`: a family, "train" or "heldout"; "" leaves the look as
-            it was recorded.
-        distractors: of `RandomisationConfig`: most things that lie about; 0 leaves what was
-            recorded.
+        appearance: as in `RandomisationConfig`: a family, "train" or "heldout"; "" keeps the
+            recorded look.
+        distractors: as in `RandomisationConfig`: largest number of distractor objects; 0 keeps what
+            was recorded.
         count: variants of each demonstration.
         corruption: largest strength of smoke, blur and pixel noise on the images
             (`core.corruption`), 0 to 1; each variant draws a strength of each, uniform from 0.

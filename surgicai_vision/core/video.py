@@ -1,11 +1,11 @@
-"""Video: images become an MP4 that browsers play, written whole or not at all.
+"""Video: write images as an MP4 that browsers play, whole or not at all.
 
     write_video(path, frames, fps=25)   # frames: any iterable of (height, width, 3) uint8 RGB
     read_video(path)                    # (n, height, width, 3)
     write_animation(path, frames, fps)  # an animated WebP, for a README
 
 H.264 by PyAV, in one thread and with no date inside: the same frames give the same bytes. (A
-dataset's videos are another matter: `dataset.video` reads them at random.)
+dataset's videos are separate: `dataset.video` reads them in random order.)
 """
 
 import itertools
@@ -28,24 +28,24 @@ ANIMATION: Final = ".webp"
 PIXELS: Final = "yuv420p"
 """The only pixel format of H.264 that every browser plays; it needs even sides."""
 REPEATABLE: Final = {"x264-params": "mbtree=0"}
-"""x264 without its macroblock tree, which on most sizes of image reads memory that nothing has
-written: with it the bytes of a video differ from run to run."""
+"""x264 without its macroblock tree, which for most image sizes reads uninitialised memory, so that
+the bytes of a video differ from run to run."""
 OPTIONS: Final = {"crf": "20", "preset": "veryfast", "threads": "1", "g": "50", **REPEATABLE}
-"""x264's: visually clean, and a key frame every 50 frames to jump to."""
+"""Options of x264: visually clean, with a key frame every 50 frames for seeking."""
 CONTAINER: Final = {"movflags": "+faststart", "fflags": "+bitexact"}
-"""The index stands before the images, so that a page plays while it loads; no date, no version."""
+"""The index comes before the images, so that a page plays while it loads; no date, no version."""
 
 
 def write_video(path: Path, frames: Iterable[Image], fps: float) -> int:
-    """Write frames as a video and return how many they were.
+    """Write frames as a video and return their number.
 
     Args:
-        path: the file, `*.mp4`; its folder is made where it is missing, an earlier file replaced.
+        path: the file, `*.mp4`; its folder is created if missing, an earlier file is replaced.
         frames: RGB images (height, width, 3) uint8 of one size with even sides.
-        fps: frames a second.
+        fps: frames per second.
 
     Raises:
-        InputError: no frames, sides that are odd or differ, or a path that is no `.mp4`.
+        InputError: no frames, sides that are odd or differ, or a path that is not `.mp4`.
     """
     import av
 
@@ -101,17 +101,17 @@ def read_video(path: Path) -> NDArray[np.uint8]:
 def write_animation(
     path: Path, frames: Iterable[Image], fps: float, quality: int = 60, effort: int = 6
 ) -> int:
-    """Write frames as an animated WebP, which pages show without a player, and count them.
+    """Write frames as an animated WebP, which needs no player, and return their number.
 
     Args:
-        path: the file, `*.webp`; its folder is made where it is missing.
+        path: the file, `*.webp`; its folder is created if missing.
         frames: RGB images (height, width, 3) uint8 of one size.
-        fps: frames a second.
+        fps: frames per second.
         quality: of the images, 0 to 100.
         effort: 0 (quick) to 6 (small file).
 
     Raises:
-        InputError: no frames, or a path that is no `.webp`.
+        InputError: no frames, or a path that is not `.webp`.
     """
     from PIL import Image as Pillow
 

@@ -3,9 +3,9 @@
     load_yaml("learning_rate: 3e-4")    # {"learning_rate": 0.0003}
 
 PyYAML follows YAML 1.1, whose numbers with an exponent need a dot and a sign (`3.0e-4`); in 1.2
-they do not. What else it reads is what `yaml.safe_load` does, but for three things that are refused
-before anything is made of them: a key that a table holds twice, of which PyYAML takes the last; an
-alias that stands for itself; and aliases of aliases that stand for more than memory holds.
+they do not. Otherwise it reads what `yaml.safe_load` reads, but refuses three things before
+anything is built from them: a key twice in one table, of which PyYAML takes the last; an alias that
+refers to itself; and aliases of aliases that expand to more than memory holds.
 """
 
 import re
@@ -18,22 +18,22 @@ MERGE_TAG = "tag:yaml.org,2002:merge"
 EXPONENT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 """A number with an exponent, as in YAML 1.2."""
 MOST_REPEATED = 100_000
-"""Most values that aliases may add to those written; more are no file that somebody wrote."""
+"""Most values that aliases may add to those written; nobody writes a file with more."""
 
 
 @final
 class _Loader(yaml.SafeLoader):
-    """Plain data alone, with the numbers of YAML 1.2."""
+    """Plain data only, with the numbers of YAML 1.2."""
 
 
 _Loader.add_implicit_resolver(FLOAT_TAG, EXPONENT, list("-+.0123456789"))
 
 
 def load_yaml(text: str) -> object:
-    """Return what a text holds.
+    """Return the data that a text holds.
 
     Raises:
-        yaml.YAMLError: it is no YAML, asks for an object, holds a key twice or too many aliases.
+        yaml.YAMLError: it is not YAML, requests an object, or has a key twice or too many aliases.
         ValueError: a value that does not exist, such as a 30th of February.
         RecursionError: it is nested too deeply.
     """
@@ -51,14 +51,14 @@ def load_yaml(text: str) -> object:
 
 
 def _size(node: yaml.Node, sizes: dict[yaml.Node, int]) -> int:
-    """Return how many values a node holds with its aliases written out, itself counted.
+    """Return how many values a node holds with its aliases expanded, including itself.
 
     Args:
-        node: a value of the text; one for which aliases stand is met several times.
-        sizes: what is known of the nodes met before; 0 of those that are being counted.
+        node: a value of the text; one with aliases is met several times.
+        sizes: sizes of the nodes met before; 0 for those that are being counted.
 
     Raises:
-        yaml.YAMLError: a table holds a key twice, or an alias stands for what it is a part of.
+        yaml.YAMLError: a table holds a key twice, or an alias refers to what it is a part of.
     """
     if node in sizes:
         if sizes[node] == 0:
@@ -78,7 +78,7 @@ def _size(node: yaml.Node, sizes: dict[yaml.Node, int]) -> int:
 
 
 def _check_keys(table: yaml.MappingNode) -> None:
-    """Refuse a table that holds a key twice; `<<` takes in others, whose keys it may replace."""
+    """Refuse a table that holds a key twice; `<<` merges in others, whose keys it may replace."""
     met: set[tuple[str, str]] = set()
     for key, _ in table.value:
         if not isinstance(key, yaml.ScalarNode) or key.tag == MERGE_TAG:

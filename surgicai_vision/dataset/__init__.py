@@ -2,10 +2,10 @@
 
     from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 
-`render` turns states into images (one job an episode), `writer` assembles the episodes with
+`render` turns states into images (one job per episode), `writer` assembles the episodes with
 LeRobot's metadata, `reader` opens a dataset without torch, `subset` selects some of its frames,
-`check` verifies one, `convert` takes some of its views or stores them as videos, `hub` shares one.
-Repair of a broken one: the distribution lerobot_salvage.
+`check` verifies it, `convert` keeps some of its views or stores them as videos, `hub` shares it.
+The distribution lerobot_salvage repairs a broken dataset.
 """
 
 from surgicai_vision.dataset.check import CheckReport, check_dataset

@@ -1,13 +1,13 @@
 """Check a dataset of ours: every frame, and its metadata against the frames.
 
     report = check_dataset(Path("dataset"))
-    report.ok, report.problems        # each problem one line
+    report.ok, report.problems        # one line per problem
 
 `meta/surgicai.json` and LeRobot's `meta/info.json`, `meta/episodes` and `meta/stats.json` must
-agree with the data and with each other. Index columns are gapless and in order, and every number is
-finite. Every image decodes, has its size, is not of one colour and differs from the one before it
-where the arm or the needle moved; depth is positive. The digest of the decoded content is the one
-recorded when it was rendered.
+agree with the data and with each other. Index columns must be gapless and in order, and every
+number finite. Every image must decode, have the right size, not be of one colour, and differ from
+the previous one if the arm or the needle moved; depth must be positive. The digest of the decoded
+content must be the one recorded at rendering.
 """
 
 from collections.abc import Iterator, Mapping
@@ -31,20 +31,20 @@ from surgicai_vision.dataset.rules import ImageWatch, episode_problems, number_p
 from surgicai_vision.dataset.stats import column_statistics
 
 MOST_PROBLEMS = 50
-"""Problems listed; the rest is counted."""
+"""Number of problems that are listed; the others are only counted."""
 STATISTICS_TOLERANCE = 1e-4
 """Largest deviation of a column's statistics, relative to the column's largest value."""
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What a check found.
+    """The result of a check.
 
     Attributes:
         frames: number of frames that were read.
         episodes: number of episodes that were read.
-        digest: of the content.
-        problems: one line each.
+        digest: digest of the content.
+        problems: one line per problem.
     """
 
     frames: int
@@ -59,14 +59,14 @@ class CheckReport:
 
 
 def check_dataset(path: Path, progress: Progress = silent) -> CheckReport:
-    """Read all of a dataset and report what is wrong with it.
+    """Read a whole dataset and report what is wrong with it.
 
     Args:
         path: a dataset of ours.
         progress: called with (frames done, frames, "frames").
 
     Raises:
-        BadFile: it cannot be opened at all, or surgicai-vision did not render it.
+        BadFile: it cannot be opened at all, or was not rendered by surgicai-vision.
     """
     if (path / INFO).is_file() and not (path / names.META_FILE).exists():
         raise BadFile(
@@ -95,7 +95,7 @@ def check_dataset(path: Path, progress: Progress = silent) -> CheckReport:
 
 
 def first_problems(problems: list[str]) -> tuple[str, ...]:
-    """Return the first `MOST_PROBLEMS` problems and, where there are more, how many."""
+    """Return the first `MOST_PROBLEMS` problems and, if there are more, how many more."""
     more = len(problems) - MOST_PROBLEMS
     return (*problems[:MOST_PROBLEMS], *([f"… and {more} more."] if more > 0 else []))
 
@@ -167,7 +167,7 @@ def _check_statistics(
     for name in ("min", "max", "mean", "std", "count"):
         try:
             given = np.ravel(np.asarray(recorded.get(name, np.nan), dtype=np.float64))
-        except (TypeError, ValueError, OverflowError):  # no numbers, or one of hundreds of digits
+        except (TypeError, ValueError, OverflowError):  # not a number, or one with too many digits
             given = np.zeros(0)
         fits = given.shape == np.shape(exact[name])
         if not fits or not np.allclose(given, exact[name], atol=STATISTICS_TOLERANCE * scale):
@@ -199,7 +199,7 @@ def _check_episode(
 def _frames(
     dataset: RenderedDataset, key: str, start: int, stop: int, problems: list[str]
 ) -> Iterator[NDArray[np.uint8 | np.float32]]:
-    """Yield an episode's images of one column; those before the first that cannot be decoded."""
+    """Yield an episode's images of one column, up to the first that cannot be decoded."""
     try:
         yield from dataset.decoded(key, start, stop)
     except BadFile as error:

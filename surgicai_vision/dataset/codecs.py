@@ -1,4 +1,4 @@
-"""Image codecs, lossless: RGB and segmentation as PNG, depth as float32 TIFF in metres."""
+"""Lossless image codecs: RGB and segmentation as PNG, depth as float32 TIFF in metres."""
 
 from collections.abc import Buffer
 
@@ -13,8 +13,8 @@ PNG = (
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH),
 )
-"""One filter and no search for repetitions: 1.6 ms and 65 kB of a textured 224 × 224 image. With a
-filter chosen for each row and run lengths it is 1 % smaller and takes 1.5 times as long; zlib's
+"""One filter and no search for repetitions: 1.6 ms and 65 kB for a textured 224 × 224 image. With a
+filter chosen per row and run-length encoding, it is 1 % smaller and takes 1.5 times as long; zlib's
 level 6 is 6 % smaller and takes seven times as long."""
 
 
@@ -22,7 +22,7 @@ def encode(frame: NDArray[np.uint8 | np.float32]) -> bytes:
     """Encode an image.
 
     Args:
-        frame: (H, W, 3) uint8 becomes an RGB PNG, (H, W, 1) uint8 a PNG of three equal channels,
+        frame: (H, W, 3) uint8 becomes an RGB PNG, (H, W, 1) uint8 a PNG with three equal channels,
             (H, W, 1) float32 a TIFF.
     """
     if frame.dtype == np.float32:
@@ -43,8 +43,8 @@ DEPTH_NEAR = 0.02
 DEPTH_FAR = 0.22
 """Nearest and farthest depth that a grey image shows [m], in steps of 0.8 mm.
 
-The needle, the instruments and the phantom's middle are within them in every camera (measured:
-0.029 to 0.163 m).
+The needle, the instruments and the phantom's middle are within this range in every camera
+(measured: 0.029 to 0.163 m).
 """
 
 
@@ -55,10 +55,10 @@ def grey(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def decode(content: Buffer | None, where: str) -> NDArray[np.uint8 | np.float32]:
-    """Decode the buffer of an image to (H, W, 3) uint8 RGB or (H, W, 1) float32.
+    """Decode an image's buffer to (H, W, 3) uint8 RGB or (H, W, 1) float32.
 
     Raises:
-        BadFile: not an image; `where` says which.
+        BadFile: not an image; the message names it by `where`.
     """
     data = np.frombuffer(content or b"", np.uint8)
     try:

@@ -1,12 +1,12 @@
-"""Make a dataset from a dataset: fewer views, or videos in the place of images.
+"""Make a dataset from another dataset: fewer views, or videos instead of images.
 
     convert_dataset(Path("dataset"), Path("dataset-back"), views=("back",))
     made = convert_dataset(Path("dataset"), Path("dataset-h264"), video="h264")
     made.video_error                # view → mean absolute error of its pixels, out of 255
 
-Nothing is rendered. Columns, depth, segmentation and, without `video`, the images are copied byte
-by byte. A video is lossy: every frame is decoded again and compared with its image, and the error
-is written into `meta/surgicai.json`.
+Nothing is rendered. Columns, depth, segmentation and, without `video`, the images are copied
+byte for byte. A video is lossy: every frame is decoded again and compared with its image, and the
+error is written to `meta/surgicai.json`.
 """
 
 import dataclasses
@@ -40,14 +40,14 @@ from surgicai_vision.dataset.writer import DataFiles
 
 @dataclass(frozen=True)
 class DatasetSummary:
-    """What was made.
+    """Summary of a dataset that was made.
 
     Attributes:
         frames: number of frames.
         episodes: number of episodes.
         seconds: wall-clock time.
-        digest: of the decoded content.
-        video_error: view → mean absolute error of its video, out of 255; none where images are
+        digest: digest of the decoded content.
+        video_error: view → mean absolute error of its video, out of 255; empty if the images are
             lossless.
     """
 
@@ -70,15 +70,15 @@ def convert_dataset(
 
     Args:
         path: a dataset of ours.
-        out: dataset folder to make; the same request finds it finished.
+        out: dataset folder to create; repeating the same request reuses it.
         views: some of its views, in the order of the new dataset's columns; all by default.
         video: codec, a key of `video.CODECS`; by default images stay as they are.
         context: workers, engine and display.
 
     Raises:
-        UnknownName: a view that the dataset does not have, an unknown codec.
-        InputError: a video was asked of a dataset of videos, or of images of a size that it does
-            not have.
+        UnknownName: a view that the dataset does not have, or an unknown codec.
+        InputError: videos were requested from a dataset of videos, or from images whose size the
+            codec does not support.
         OutputExists: `out` holds something else.
     """
     started = time.monotonic()
@@ -116,7 +116,7 @@ def check_video(video: str | None, size: int) -> None:
 
     Raises:
         UnknownName: an unknown codec.
-        InputError: a size that the codec does not have.
+        InputError: a size that the codec does not support.
     """
     if video is None:
         return
@@ -137,7 +137,7 @@ def finished(out: Path, request: Table, started: float) -> DatasetSummary:
     """Return the summary of a finished dataset.
 
     Raises:
-        OutputExists: it is not the one that was requested.
+        OutputExists: it is not the requested dataset.
     """
     meta = read_json(out / names.META_FILE)
     if meta.get("request") != request:
@@ -145,7 +145,7 @@ def finished(out: Path, request: Table, started: float) -> DatasetSummary:
             f"--out {out} holds a dataset of other demonstrations or options (see "
             f"{out / names.META_FILE}); give another folder."
         )
-    # Left by a run that was killed after its last step.
+    # A run that was killed after its last step leaves this behind.
     shutil.rmtree(work_folder(out), ignore_errors=True)
     seconds = time.monotonic() - started
     errors = meta.get("video_error", {})
@@ -162,15 +162,15 @@ def write_converted(
     context: RunContext,
     progress: Progress,
 ) -> None:
-    """Write the new dataset, whole.
+    """Write the new dataset atomically.
 
     Args:
         dataset: the dataset to convert.
-        out: folder to make.
+        out: folder to create.
         views: some of its views.
         video: codec, or None for images as they are.
-        changes: replace values of its `meta/surgicai.json`.
-        store: folder of the results of the jobs that make videos.
+        changes: values that replace those of its `meta/surgicai.json`.
+        store: folder for the results of the jobs that make videos.
         context: workers and engine.
         progress: counts frames.
     """
@@ -184,7 +184,7 @@ def write_converted(
     keys = [key for key, _, _ in shown]
     features = _features(files, dataset, views, keys, video)
     with whole_folder(out) as folder:
-        # Where every episode is in the videos, by feature; empty without videos.
+        # Each episode's place in the videos, by feature; empty without videos.
         encoded: list[dict[str, Encoded]] = []
         if video:
             encoded = encode_views(dataset, folder, views, video, store, context, progress)
@@ -259,7 +259,7 @@ def _write_data(
 def _check_complete(
     files: LeRobotFiles, rows: Sequence[EpisodeMetadata], dataset: RenderedDataset
 ) -> None:
-    """Refuse a dataset of which not every episode and frame could be read."""
+    """Refuse a dataset unless every episode and frame could be read."""
     frames = rows[-1].stop if rows else 0
     if len(rows) != len(files.rows) or frames != dataset.length:
         raise BadFile(
@@ -270,7 +270,7 @@ def _check_complete(
 
 
 def _copy_videos(files: LeRobotFiles, folder: Path, keys: Sequence[str]) -> list[dict[str, Place]]:
-    """Take over the videos of `keys`; return where each episode is in them."""
+    """Copy the videos of `keys`; return where each episode is in them."""
     places: list[dict[str, Place]] = [{} for _ in files.rows]
     for key in keys:
         for file in files.path.glob(f"videos/{key}/chunk-*/file-*.mp4"):

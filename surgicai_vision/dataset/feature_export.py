@@ -1,10 +1,10 @@
-"""Export a dataset with frozen features in place of images, for LeRobot's ACT and Diffusion.
+"""Export a dataset with frozen features instead of images, for LeRobot's ACT and Diffusion.
 
     export_features(dataset, rows, about, out)
 
-The features of all views stand side by side in `observation.environment_state`, which both policies
-take without any image. `meta/surgicai.json` says in `features` which encoder they are of, so that
-the env shows the same.
+The features of all views are concatenated in `observation.environment_state`, which both policies
+accept without any image. `features` in `meta/surgicai.json` names the encoder, so that the env can
+provide the same features.
 """
 
 import tempfile
@@ -30,17 +30,17 @@ from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, assemble,
 def export_features(
     dataset: RenderedDataset, rows: Sequence[NDArray[np.floating]], about: Table, out: Path
 ) -> None:
-    """Write `out`: the columns of `dataset` and its features, no images.
+    """Write `out`: the columns of `dataset` and its features, without images.
 
     Args:
         dataset: an opened dataset.
         rows: (N, dim) features of each view.
-        about: `encoder`, `views` and `weights_sha256`, kept in `meta/surgicai.json`.
+        about: `encoder`, `views` and `weights_sha256`, stored in `meta/surgicai.json`.
         out: the new dataset's folder.
 
     Raises:
         OutputExists: there is something at `out` other than an empty folder.
-        InputError: features of another number of frames.
+        InputError: the features are of a different number of frames.
     """
     check_output(out, option="--export")
     for entry in rows:
@@ -78,7 +78,7 @@ def export_features(
 
 
 def _write_shard(folder: Path, columns: Mapping[str, NDArray[np.generic]]) -> Path:
-    """Write one episode as `assemble` reads it."""
+    """Write one episode in the form that `assemble` reads."""
     folder.mkdir()
     arrays = {key: column_array(values) for key, values in columns.items()}
     pq.write_table(pa.table(arrays), folder / EPISODE_FILE)

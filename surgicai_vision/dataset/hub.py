@@ -4,8 +4,8 @@
     pull_dataset("somebody/suturing-grasp", Path("dataset"))
     dataset_card(open_dataset(Path("dataset")), "somebody/suturing-grasp")
 
-A push is one commit, tagged with LeRobot's format version as its own loader asks for. Without a
-network both end at once with one line.
+A push is one commit, tagged with LeRobot's format version, as its own loader requires. Without a
+network, push and pull fail at once with a one-line error.
 """
 
 import io
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 CARD = "README.md"
 LICENCE = "mit"
 KEPT = ("meta", "data", "videos")
-"""Folders of a LeRobot v3 dataset; nothing else of a folder is pushed or pulled."""
+"""Folders of a LeRobot v3 dataset; nothing else in a dataset's folder is pushed or pulled."""
 
 
 def dataset_card(dataset: RenderedDataset, repo: str, licence: str = LICENCE) -> str:
-    """Return the card of a dataset, Markdown with the Hub's header."""
+    """Return a dataset's card: Markdown with the Hub's header."""
     meta = dataset.meta
     images = dataset.image_keys
     size = f"{dataset.image_size} × {dataset.image_size}"
@@ -122,11 +122,11 @@ def push_dataset(
 
     Args:
         path: the dataset.
-        repo: "user/name"; made when it does not exist.
+        repo: "user/name"; created if it does not exist.
         private: make it private.
         licence: the Hub's short name of a licence.
-        progress: called while it is checked.
-        api: a `huggingface_hub.HfApi`; made here by default.
+        progress: called while the dataset is checked.
+        api: a `huggingface_hub.HfApi`; created here by default.
 
     Raises:
         InputError: a bad name.
@@ -163,12 +163,12 @@ def pull_dataset(
 ) -> CheckReport:
     """Fetch a dataset of ours into the new folder `out` and check it.
 
-    Called again after a failure, it goes on with what was fetched.
+    A call after a failure continues with what was already fetched.
 
     Raises:
         InputError: a bad name.
         OutputExists: `out` holds something.
-        BadFile: what came is damaged or no dataset.
+        BadFile: what was fetched is damaged or not a dataset of ours.
         SurgicaiError: offline, or the Hub refuses.
     """
     check_output(out)
@@ -193,7 +193,7 @@ def pull_dataset(
         report = check_dataset(fetched, progress)
         _whole(report, repo)
         if out.exists():
-            out.rmdir()  # empty: checked before
+            out.rmdir()  # empty, as checked above
         os.rename(fetched, result)
     return report
 

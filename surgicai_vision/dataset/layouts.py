@@ -1,11 +1,11 @@
-"""Layouts: which columns a rendered dataset has, and what they are called.
+"""Layouts: which columns a rendered dataset has, and their names.
 
 * `surgicai`: ours, `dataset.schema`: increments of the active arm, and everything that the product
   trains, checks and evaluates with.
-* `open-h`: the field's, `dataset.open_h`: both arms' absolute poses, for policies of others.
+* `open-h`: the field's, `dataset.open_h`: both arms' absolute poses, for other people's policies.
 
-A layout says what is measured in every state that is rendered, what is taken from the
-demonstration beside it, and in which order the columns enter the digest.
+A layout defines what is measured in every rendered state, what is taken from the demonstration,
+and in which order the columns enter the digest.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,15 +34,15 @@ class Layout(Protocol):
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Views that are rendered where none are named."""
+        """Views that are rendered if none are named."""
 
     @property
     def about(self) -> Mapping[str, JSON]:
-        """What `meta/surgicai.json` says besides; `robot_type` is LeRobot's too."""
+        """Additional entries of `meta/surgicai.json`; `robot_type` is also LeRobot's."""
 
     @property
     def measured(self) -> Mapping[str, Measure]:
-        """Column → what the env measures in the state that was set."""
+        """Column → what the env measures in the state it was set to."""
 
     def image_keys(
         self, views: Sequence[str], depth: bool, segmentation: bool
@@ -55,18 +55,18 @@ class Layout(Protocol):
         """Return LeRobot's feature table."""
 
     def columns(self, views: Sequence[str]) -> tuple[str, ...]:
-        """Return every column that is no image, in the order of the digest."""
+        """Return every column that is not an image, in the order of the digest."""
 
     def recorded(
         self, demo: Demo, frame_stride: int, env: "SuturingEnv"
     ) -> dict[str, NDArray[np.generic]]:
         """Return the columns that are taken from the demonstration, (frames,) or (frames, n).
 
-        `env` shows its states; it may be set to any.
+        `env` can show the demonstration's states and may be set to any state.
         """
 
     def task_config(self, config: TaskConfig, frame_stride: int) -> TaskConfig:
-        """Return the env in which a policy acts as the dataset's frames do."""
+        """Return the config of the env in which a policy's actions mean what the dataset's do."""
 
 
 class SurgicaiLayout:
@@ -97,21 +97,21 @@ class SurgicaiLayout:
         return schema.features(views, size, depth, segmentation)
 
     def columns(self, views: Sequence[str]) -> tuple[str, ...]:
-        """Return every column that is no image, in the order of the digest."""
+        """Return every column that is not an image, in the order of the digest."""
         return schema.columns(views)
 
     def recorded(
         self, demo: Demo, frame_stride: int, env: "SuturingEnv"
     ) -> dict[str, NDArray[np.generic]]:
-        """Return action, reward, success, contact, phase and seed; actions are those of a step."""
+        """Return action and labels (reward, success, phase, …); an action is that of one step."""
         return {names.ACTION: demo.action[::frame_stride], **schema.labels(demo, frame_stride)}
 
     def task_config(self, config: TaskConfig, frame_stride: int) -> TaskConfig:
-        """Return the config as it is: whatever the stride, an action is that of one step."""
+        """Return the config unchanged: whatever the stride, an action is that of one step."""
         return config
 
 
 LAYOUTS: Mapping[str, Layout] = MappingProxyType(
     {SURGICAI: SurgicaiLayout(), OPEN_H: open_h.OpenHLayout()}
 )
-"""Layout name → what it is."""
+"""Layout name → layout."""

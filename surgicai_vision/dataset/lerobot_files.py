@@ -1,11 +1,11 @@
-"""Read the files of any LeRobot v3 dataset one episode at a time, without trust.
+"""Read the files of any LeRobot v3 dataset one episode at a time, without trusting them.
 
     files = LeRobotFiles(Path("dataset"))
     files.features, files.fps, files.tasks, files.rows      # what its metadata says
-    for table in files.episodes(): …                        # one pyarrow table an episode, in order
+    for table in files.episodes(): …                        # a pyarrow table per episode, in order
 
-Nothing is needed but `meta/info.json`: what else is missing or damaged is listed in `problems`, and
-reading ends where the data does.
+Only `meta/info.json` is required. Anything else that is missing or damaged is listed in `problems`,
+and reading ends where the data does.
 """
 
 import itertools
@@ -28,25 +28,25 @@ DATA = "data/chunk-*/file-*.parquet"
 EPISODES = "meta/episodes/chunk-*/file-*.parquet"
 VERSIONS = ("v3.0", "v3.1")
 type OpenFile = Callable[[Path], pq.ParquetFile]
-"""Opens a data file; lerobot_salvage gives one that recovers a file without a footer."""
+"""Opens a data file; lerobot_salvage passes one that recovers a file without a footer."""
 UNREADABLE = (OSError, KeyError, ValueError, TypeError, pa.ArrowException)
 
 
 class LeRobotFiles:
-    """A LeRobot dataset's metadata and its way to the data.
+    """A LeRobot dataset's metadata and access to its data.
 
     Attributes:
         path: its folder.
         info: content of `meta/info.json`.
         features: LeRobot's feature table, shapes as tuples.
         fps: frames per second.
-        tasks: sentence of every task index.
-        rows: rows of `meta/episodes`, in order; none where they cannot be read.
+        tasks: task index → its sentence.
+        rows: rows of `meta/episodes`, in order; empty if they cannot be read.
         statistics: content of `meta/stats.json`.
-        problems: what is wrong so far, one line each.
+        problems: problems found so far, one line each.
 
     Raises:
-        BadFile: no `meta/info.json` of a LeRobot v3 dataset.
+        BadFile: there is no `meta/info.json` of a LeRobot v3 dataset.
     """
 
     def __init__(self, path: Path):
@@ -111,7 +111,7 @@ class LeRobotFiles:
             return {}
 
     def _read_rows(self) -> list[Table]:
-        """Read `meta/episodes` up to the first row that is missing or not in order."""
+        """Read `meta/episodes` up to the first row that is missing or out of order."""
         rows: list[Table] = []
         files = sorted(self.path.glob(EPISODES))
         try:
@@ -172,7 +172,7 @@ def _number(table: pa.Table) -> int:
 
 
 def _split(table: pa.Table) -> Iterator[pa.Table]:
-    """Cut a table where `episode_index` changes."""
+    """Split a table where `episode_index` changes."""
     if not len(table):
         return
     numbers = table.column("episode_index").to_numpy()

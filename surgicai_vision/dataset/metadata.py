@@ -3,9 +3,9 @@
     schema = arrow_schema(features)             # of data files, with Hugging Face's feature types
     write_metadata(folder, features, tasks, episodes)
 
-Importing LeRobot's own writer takes 11 s on an idle machine (torch, torchvision, datasets), where
-everything else here takes one. `tests/dataset/test_dataset.py` compares each part with what lerobot
-0.6.1 writes.
+Importing LeRobot's own writer takes 11 s on an idle machine (torch, torchvision, datasets);
+everything else here takes one second. `tests/dataset/test_dataset.py` compares each part with what
+lerobot 0.6.1 writes.
 """
 
 import json
@@ -25,7 +25,7 @@ from surgicai_vision.dataset.stats import Statistics
 
 CODEBASE_VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
-"""LeRobot's default, as the two below."""
+"""LeRobot's default, like the two below."""
 DATA_FILE_MB = 100
 VIDEO_FILE_MB = 200
 ROBOT_TYPE = "psm"
@@ -37,10 +37,10 @@ INDEX_FEATURES: Mapping[str, str] = {
     "index": "int64",
     "task_index": "int64",
 }
-"""Columns LeRobot adds to every dataset → dtype."""
+"""Column that LeRobot adds to every dataset → dtype."""
 
 Features = Mapping[str, Table]
-"""LeRobot's feature table: key → dtype, shape, names and more."""
+"""LeRobot's feature table: key → dtype, shape, names, etc."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class EpisodeMetadata:
         stop: the frame after its last.
         file: number of its data file.
         statistics: its statistics by feature.
-        tasks: sentences of its tasks; none where the dataset has one task.
-        videos: feature → (file's number, first second, second after the last).
+        tasks: sentences of its tasks; empty for all tasks of the dataset.
+        videos: feature → (number of the file, begin [s], end [s]).
     """
 
     start: int
@@ -67,7 +67,7 @@ class EpisodeMetadata:
 
 
 def all_features(features: Features) -> Features:
-    """Return the features with the columns LeRobot adds."""
+    """Return the features and the columns that LeRobot adds."""
     added = {
         key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in INDEX_FEATURES.items()
     }
@@ -122,10 +122,10 @@ def write_metadata(
 
     Args:
         folder: the dataset.
-        features: its features, without the columns LeRobot adds.
+        features: its features, without the columns that LeRobot adds.
         tasks: the sentence of every task, in the order of `task_index`.
         episodes: every episode, in order.
-        origin: the `meta/info.json` of the dataset it is made from, some of which is kept.
+        origin: the `meta/info.json` of the dataset it is made from; some of its entries are kept.
     """
     import pandas
 
@@ -151,7 +151,7 @@ def write_metadata(
         "splits": {"train": f"0:{len(episodes)}"},
         **{key: origin[key] for key in kept if key in origin},
     }
-    # In the order of the features, which is the order LeRobot shows and policies stack them in.
+    # Keys keep the order of the features, in which LeRobot shows and policies stack them.
     (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
     index = pandas.Index(list(tasks), name="task")
     table = pandas.DataFrame({"task_index": range(len(tasks))}, index=index)
@@ -194,7 +194,7 @@ def row_statistics(row: Table) -> dict[str, Statistics]:
 
 
 def aggregate(episodes: Sequence[Mapping[str, Statistics]]) -> dict[str, Statistics]:
-    """Return the statistics of all episodes; quantiles are LeRobot's means weighted by frames."""
+    """Return the statistics of all episodes; quantiles are frame-weighted means, as in LeRobot."""
     return {key: _aggregate([episode[key] for episode in episodes]) for key in episodes[0]}
 
 

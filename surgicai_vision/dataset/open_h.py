@@ -1,34 +1,34 @@
-"""The layout of Open-H-Embodiment, in which the field's dVRK data are published.
+"""The layout of Open-H-Embodiment, in which the field publishes its dVRK data.
 
     surgicai-vision render-demos --task suture --layout open-h
 
-| column | what it is |
+| column | content |
 |---|---|
 | `observation.images.endoscope.left`, `….right` | the two eyes of the endoscope |
 | `observation.images.wrist.left`, `….right` | the wrist cameras of PSM2 and of PSM1 |
 | `observation.state` (16,) | both arms' measured poses and jaws (`envs.absolute.measured`) |
-| `action` (16,) | the set-points that they are given next (`envs.absolute.setpoints`) |
-| `instruction.text` | the subtask in words, frame by frame |
+| `action` (16,) | the set-points that they receive next (`envs.absolute.setpoints`) |
+| `instruction.text` | the subtask in words, per frame |
 | `needle_pose`, `phase`, `seed`, `contact`, `next.*`, `calibration.*` | ours, as in `schema` |
 
 `robot_type` is `dvrk`; `task` is the whole task in words.
 
-Sources: names, order, shapes and `names` of features (one list within a list) from
-`scripts/conversion/dvrk_zarr_to_lerobot.py` of github.com/open-h/open-h-embodiment, whose LeRobot
-v3 form this is; `wrist.left` is PSM2's there, and `psm1_pose`, `psm1_sp`, `psm1_jaw`, `psm1_jaw_sp`
-are recorded from `/PSM1/measured_cp`, `/PSM1/setpoint_cp`, `/PSM1/jaw/measured_js` and
-`/PSM1/jaw/setpoint_js`. The first public sets of it (Open-H-Embodiment v1, SutureBot, SutureBot2)
-are LeRobot v2.1 of the same columns.
+Sources: names, order, shapes and `names` of features (one list within a list) are from
+`scripts/conversion/dvrk_zarr_to_lerobot.py` of github.com/open-h/open-h-embodiment; this layout is
+its LeRobot v3 form. There, `wrist.left` is PSM2's, and `psm1_pose`, `psm1_sp`, `psm1_jaw` and
+`psm1_jaw_sp` are recorded from `/PSM1/measured_cp`, `/PSM1/setpoint_cp`, `/PSM1/jaw/measured_js`
+and `/PSM1/jaw/setpoint_js`. The first public datasets (Open-H-Embodiment v1, SutureBot, SutureBot2)
+are LeRobot v2.1 with the same columns.
 
-What differs: keys follow the arm, and our PSM2 stands on the right of the endoscope's image, as in
-SurgicAI, where a dVRK's usually stands on the left. Images are square. Columns of ours are no
-observation by their names, so that a policy is fed none of them. The original's texts
-`observation.meta.tool.psm1` and `….psm2` stand in `meta/surgicai.json` as `instruments`: LeRobot
-0.6.1 takes every column called `observation.…` for numbers that a policy sees, and its training
-ends at a text ("too many dimensions 'str'").
+Differences: keys follow the arm, and our PSM2 is on the right of the endoscope's image, as in
+SurgicAI, whereas a dVRK's is usually on the left. Images are square. The names of our own columns
+do not mark them as observations, so no policy receives them. The original's texts
+`observation.meta.tool.psm1` and `….psm2` are in `meta/surgicai.json` as `instruments`: LeRobot
+0.6.1 treats every column called `observation.…` as numeric input of a policy, and its training
+fails on a text ("too many dimensions 'str'").
 
-An action is where the arms are told to be when the next frame is taken, so with a frame stride
-whoever acts holds it for that many control steps: `task_config` says so by its `action_repeat`.
+An action is the commanded pose of the arms when the next frame is taken. With a frame stride, it is
+therefore held for that many control steps; `task_config` sets `action_repeat` accordingly.
 """
 
 import dataclasses
@@ -58,7 +58,7 @@ IMAGES: Mapping[str, str] = MappingProxyType(
         "wrist_psm1": "wrist.right",
     }
 )
-"""View → what an image key calls it after `observation.images.`; other views keep their names."""
+"""View → its name in an image key after `observation.images.`; other views keep their names."""
 INSTRUCTION = "instruction.text"
 INSTRUMENT = "Large Needle Driver"
 """Both arms' instrument: 400006 and 420006 are Large Needle Drivers (a dVRK's tool files)."""
@@ -72,7 +72,7 @@ VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 
 def image_name(view: str) -> str:
-    """Return what the layout calls a view."""
+    """Return a view's name in the layout."""
     return IMAGES.get(view, view)
 
 
@@ -120,15 +120,15 @@ class OpenHLayout:
         return table | {key: own[key] for key in self.columns(views) if key not in table}
 
     def columns(self, views: Sequence[str]) -> tuple[str, ...]:
-        """Return every column that is no image, in the order of the digest."""
+        """Return every column that is not an image, in the order of the digest."""
         own = (names.NEEDLE_POSE, *schema.SCALARS, *schema.calibration_keys(views))
         return (*VECTORS, INSTRUCTION, *own)
 
     def recorded(
         self, demo: Demo, frame_stride: int, env: "SuturingEnv"
     ) -> dict[str, NDArray[np.generic]]:
-        """Return set-points, texts and labels; rewards and marks are those of the frame's end."""
-        from surgicai_vision.envs.absolute import setpoints  # rendering alone needs MuJoCo
+        """Return set-points, texts and labels; reward, success and contact: at the frame's end."""
+        from surgicai_vision.envs.absolute import setpoints  # only rendering needs MuJoCo
 
         steps = np.arange(0, len(demo), frame_stride)
         ends = np.minimum(steps + frame_stride, len(demo))
@@ -161,5 +161,5 @@ class OpenHLayout:
 
 
 def instruction(task: str, phase: int) -> str:
-    """Return what is to be done in words, of a task and the subtask's index in it (-1 for none)."""
+    """Return the instruction in words for a task and the subtask's index in it (-1 for none)."""
     return task_text(names.SUBTASKS[phase] if phase >= 0 else task)

@@ -1,7 +1,7 @@
 """What every dataset offers to encoding, probing, training and evaluation.
 
-A `reader.RenderedDataset` and a `subset.DatasetSubset` are datasets in this sense; whatever reads
-one names this protocol in its signature.
+`reader.RenderedDataset` and `subset.DatasetSubset` implement this protocol; functions that read a
+dataset name it in their signatures.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ class Dataset(Protocol):
 
     @property
     def path(self) -> Path:
-        """Folder of the rendered dataset; a subset has that of its whole."""
+        """Folder of the rendered dataset; for a subset, that of the whole."""
 
     @property
     def task(self) -> str:
@@ -35,7 +35,7 @@ class Dataset(Protocol):
 
     @property
     def policy_views(self) -> tuple[str, ...]:
-        """What `frames` shows: the views, and their depth views where depth was rendered."""
+        """What `frames` shows: the views, and their depth views if depth was rendered."""
 
     @property
     def image_size(self) -> int:
@@ -55,17 +55,17 @@ class Dataset(Protocol):
 
     @property
     def episode_index(self) -> NDArray[np.int64]:
-        """Episode of every frame, (N,) int64, rising."""
+        """Episode of every frame, (N,) int64, ascending."""
 
     @property
     def demonstration_index(self) -> NDArray[np.int64]:
-        """Demonstration of every frame, (N,) int64, rising; several episodes may show one."""
+        """Demonstration of every frame, (N,) int64, ascending; several episodes may show one."""
 
     def bounds(self) -> list[tuple[int, int]]:
         """Return (first frame, frame after the last) of every episode."""
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
-        """Return every column that is no image, (N,) or (N, n), by its key."""
+        """Return every column that is not an image, (N,) or (N, n), by its key."""
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Return the images of one of the `policy_views`, (stop - start, H, W, 3) uint8 RGB."""

@@ -4,11 +4,11 @@
     dataset.length, dataset.views, dataset.episode_index, dataset.columns()
     dataset.frames("front", 0, 64)          # (64, 224, 224, 3) uint8 RGB
     dataset.depth("front", 0, 64)           # (64, 224, 224, 1) float32 [m]
-    dataset.intrinsics("front_psm2")        # (N, 3, 3) K, of a crop with its window
+    dataset.intrinsics("front_psm2")        # (N, 3, 3) K; that of a crop includes its window
     dataset.extrinsics("front_psm2")        # (N, 4, 4) T_world_camera
 
-Frames are numbered over the whole dataset, as LeRobot's `index` column. Reading in order keeps one
-row group (one episode) of one column in memory.
+Frames are numbered over the whole dataset, like LeRobot's `index` column. The encoded images of the
+last few row groups (one episode of one column each) are kept in memory.
 """
 
 import functools
@@ -40,7 +40,7 @@ from surgicai_vision.dataset.protocol import episode_bounds
 from surgicai_vision.dataset.video import read_frames
 
 DAMAGED = (AttributeError, KeyError, TypeError, ValueError, OverflowError, InputError)
-"""What a value of another type, or out of its range, in the metadata raises."""
+"""Errors raised by a value of the wrong type, or out of its range, in the metadata."""
 VIDEO_PLACE = ("chunk_index", "file_index", "from_timestamp")
 
 
@@ -48,13 +48,13 @@ def open_dataset(path: Path) -> "RenderedDataset":
     """Open the dataset in folder `path`.
 
     Raises:
-        BadFile: no dataset of ours, or one whose files are damaged or do not fit each other.
+        BadFile: not a dataset of ours, or its files are damaged or inconsistent.
     """
     return RenderedDataset(path)
 
 
 class _RowGroup(NamedTuple):
-    """A row group: its file, its number there, its first frame and number of frames."""
+    """A row group: its file, its number in the file, its first frame and its number of frames."""
 
     file: int
     number: int
@@ -75,9 +75,9 @@ class RenderedDataset:
         image_size: side of the images [px].
         length: number of frames N.
         fps: frames per second of simulated time; `names.FPS` divided by the frame stride.
-        variants: episodes that show one demonstration, one behind the other in different looks.
-        video: codec of the RGB views, None where they are lossless images.
-        late: most control steps by which its demonstrators noticed a loss late
+        variants: number of consecutive episodes that show one demonstration in different looks.
+        video: codec of the RGB views, None if they are lossless images.
+        late: the most control steps by which its demonstrators noticed a loss late
             (`demos.disturbance.Disturbance`).
     """
 
@@ -127,7 +127,7 @@ class RenderedDataset:
 
     @functools.cached_property
     def task_index(self) -> NDArray[np.int64]:
-        """LeRobot's number of every frame's task, (N,) int64; a dataset of ours has one task, 0."""
+        """LeRobot's task index of every frame, (N,) int64; a dataset of ours has only task 0."""
         return self._column("task_index").astype(np.int64, copy=False)
 
     @functools.cached_property
@@ -137,12 +137,12 @@ class RenderedDataset:
 
     @functools.cached_property
     def demonstration_index(self) -> NDArray[np.int64]:
-        """Demonstration of every frame, (N,) int64, rising."""
+        """Demonstration of every frame, (N,) int64, ascending."""
         return self.episode_index // self.variants
 
     @property
     def policy_views(self) -> tuple[str, ...]:
-        """What `frames` shows: the views, and their depth views where depth was rendered."""
+        """What `frames` shows: the views, and their depth views if depth was rendered."""
         depth = tuple(f"{view}_depth" for view in camera_names() if view in self.views)
         return self.views + (depth if self.has_depth else ())
 
@@ -154,7 +154,7 @@ class RenderedDataset:
 
     @property
     def video_keys(self) -> frozenset[str]:
-        """Image columns that are videos."""
+        """Image columns that are stored as videos."""
         return frozenset(map(names.image_key, self.views)) if self.video else frozenset()
 
     def bounds(self) -> list[tuple[int, int]]:
@@ -162,7 +162,7 @@ class RenderedDataset:
         return episode_bounds(self.episode_index)
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
-        """Return every column that is no image, (N,) or (N, n), by its key."""
+        """Return every column that is not an image, (N,) or (N, n), by its key."""
         keys = (*schema.columns(self.views), "frame_index", "timestamp", "index")
         return {key: self._column(key) for key in keys}
 
@@ -178,7 +178,7 @@ class RenderedDataset:
         return self._images(names.depth_key(self._view(view)), start, stop, np.float32)
 
     def segmentation(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
-        """Return indices in `names.PARTS` of a view's pixels, (stop - start, H, W, 1) uint8."""
+        """Return the index in `names.PARTS` of a view's pixels, (stop - start, H, W, 1) uint8."""
         self._check("segmentation", self.has_segmentation)
         key = names.segmentation_key(self._view(view))
         return self._images(key, start, stop, np.uint8)[..., :1]
@@ -186,18 +186,18 @@ class RenderedDataset:
     def intrinsics(self, view: str) -> NDArray[np.float32]:
         """Return a view's nominal camera matrix K of every frame, (N, 3, 3) [pixel].
 
-        Of a crop the principal point tells where its window lies in its camera's image.
+        The principal point of a crop encodes where its window lies in its camera's image.
         """
         key = names.intrinsics_key(self._view(view))
         return self._column(key).astype(np.float32, copy=False).reshape(-1, 3, 3)
 
     def extrinsics(self, view: str) -> NDArray[np.float32]:
-        """Return a view's nominal T_world_camera of every frame, OpenCV's axes, (N, 4, 4) [m]."""
+        """Return a view's nominal T_world_camera of every frame, OpenCV axes, (N, 4, 4) [m]."""
         key = names.extrinsics_key(self._view(view))
         return self._column(key).astype(np.float32, copy=False).reshape(-1, 4, 4)
 
     def decoded(self, key: str, start: int, stop: int) -> Iterator[NDArray[np.uint8 | np.float32]]:
-        """Yield the images start … stop - 1 of a column as they decode, whatever their size."""
+        """Yield the images start … stop - 1 of a column as decoded, whatever their size."""
         if key in self.video_keys:
             yield from self._from_videos(key, start, stop)
             return
@@ -226,7 +226,7 @@ class RenderedDataset:
 
     @functools.cached_property
     def _rows(self) -> list[schema.Table]:
-        """Where every episode is in the videos."""
+        """The place of every episode in the videos."""
         wanted = [f"videos/{key}/{name}" for key in self.video_keys for name in VIDEO_PLACE]
         rows: list[schema.Table] = []
         for file in sorted(self.path.glob("meta/episodes/chunk-*/file-*.parquet")):
@@ -266,7 +266,7 @@ class RenderedDataset:
     def _images[T: (np.uint8, np.float32)](
         self, key: str, start: int, stop: int | None, dtype: type[T]
     ) -> NDArray[T]:
-        """Return the decoded images start … stop - 1 of a column; depth is the float32 one."""
+        """Return the decoded images start … stop - 1 of a column; depth has dtype float32."""
         stop = self.length if stop is None else stop
         if not 0 <= start <= stop <= self.length:
             raise InputError(
@@ -336,7 +336,7 @@ def _read_meta(path: Path) -> schema.Table:
 
 
 def _checked_places(table: pa.Table, file: Path) -> pa.Table:
-    """Return a table of numbers, whole but for times; `BadFile` where they are none."""
+    """Return a table of numbers, integers except times; raise `BadFile` if they are not."""
     for name, column in zip(table.column_names, table.columns, strict=True):
         values = column.to_numpy()
         wanted = "iuf" if name.endswith(VIDEO_PLACE[-1]) else "iu"

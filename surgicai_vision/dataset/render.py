@@ -1,11 +1,12 @@
-"""Render demonstrations: states → images, one job an episode, then one LeRobot dataset.
+"""Render demonstrations: states → images, one job per episode, then one LeRobot dataset.
 
     summary = render_demos(Path("demos"), Path("dataset"), views=("front", "back"), depth=True)
     summary.frames, summary.episodes, summary.seconds, summary.digest
 
-An episode is committed whole to `<out>.work` (`render_jobs`), and when all are there the dataset is
-assembled and renamed whole to `out`. Killed anywhere, the same command continues; finished, it does
-nothing. Frames and their order do not depend on the number of workers.
+Each episode is committed atomically to `<out>.work` (`render_jobs`). When all are there, the
+dataset is assembled and renamed to `out`. If it was killed at any point, the same command
+continues; if it has finished, it does nothing. Frames and their order do not depend on the number
+of workers.
 """
 
 import shutil
@@ -60,29 +61,28 @@ def render_demos(
     """Render demonstrations into a LeRobot dataset.
 
     Args:
-        demos: folder of demonstrations, or several, one behind the other; all of one task and
-            scene.
-        out: dataset folder to make; the same request continues it or finds it finished.
-        views: cameras, in the order of the dataset's columns; by default those of the layout,
-            front and back of ours.
+        demos: folder of demonstrations, or several folders in order; all of one task and scene.
+        out: dataset folder to create; repeating the same request continues or reuses it.
+        views: cameras, in the order of the dataset's columns; by default those of the layout (of
+            ours, front and back).
         size: side of the square images [px].
         depth: also render depth, float32 [m].
         segmentation: also render part indices (`names.PARTS`).
-        frame_stride: render every n-th frame of each episode alone, from its first; a divisor of
+        frame_stride: render only every n-th frame of each episode, from its first; a divisor of
             `names.FPS`, so that the dataset has `names.FPS / frame_stride` frames per second of
-            simulated time. Increments stay those of one step; set-points of layout "open-h" are
+            simulated time. Increments remain those of one step; set-points of layout "open-h" are
             held until the next frame.
         variants: looks in which each demonstration is rendered; None renders each once, as it was
             recorded.
         video: codec of the RGB views, a key of `video.CODECS`; lossless images by default.
-        layout: which columns it has, a key of `layouts.LAYOUTS`.
+        layout: which columns the dataset has, a key of `layouts.LAYOUTS`.
         context: workers, engine and display.
 
     Raises:
         UnknownName: a view, codec or layout that does not exist.
         InputError: a folder of demonstrations that is given twice, a size or frame stride that is
-            not allowed, a video or too long a frame stride of a layout that has none.
-        BadFile: `demos` holds no readable demonstrations, or of another scene.
+            not allowed, or a video or frame stride that the layout does not support.
+        BadFile: `demos` holds no readable demonstrations, or some with another task or scene.
         OutputExists: `out` holds something else.
     """
     started = time.monotonic()
@@ -137,7 +137,7 @@ def render_demos(
 def check_request(
     views: Sequence[str], size: int, frame_stride: int, video: str | None, layout: str
 ) -> None:
-    """Refuse arguments of `render_demos` that are wrong whatever the demonstrations are."""
+    """Refuse arguments of `render_demos` that are wrong for any demonstrations."""
     chosen = LAYOUTS[check_name("layout", layout, LAYOUTS)]
     _check_images(views or chosen.views, size, video)
     check_frame_stride(frame_stride)
@@ -180,7 +180,7 @@ def _check_images(views: Sequence[str], size: int, video: str | None) -> None:
 
 
 def _check_layout(layout: str, frame_stride: int, video: str | None) -> None:
-    """Refuse what a layout of others does not have."""
+    """Refuse what a layout other than ours does not support."""
     if layout == SURGICAI:
         return
     if video:
@@ -196,7 +196,7 @@ def _check_layout(layout: str, frame_stride: int, video: str | None) -> None:
 
 
 class _Origin(NamedTuple):
-    """What is kept of a demonstration while its images are made elsewhere."""
+    """What is kept of a demonstration while other processes render its images."""
 
     length: int
     config: TaskConfig
@@ -211,7 +211,7 @@ class _Origin(NamedTuple):
 
 
 def _same_config(origins: Sequence[_Origin], paths: Sequence[Path]) -> TaskConfig:
-    """Return the one configuration of all episodes."""
+    """Return the configuration that all episodes share; refuse different ones."""
     first = origins[0]
     for path, origin in zip(paths, origins, strict=True):
         if origin.config != first.config or origin.scene_hash != first.scene_hash:

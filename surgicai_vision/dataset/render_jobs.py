@@ -1,7 +1,7 @@
 """The job that renders one episode: its states → images and columns.
 
-Every state of a demonstration is set in the environment as it was recorded and observed; frame t is
-the state before action t. This module needs MuJoCo, so only the processes that render import it.
+Every recorded state of a demonstration is set in the environment and observed; frame t is the state
+before action t. This module needs MuJoCo, so only the processes that render import it.
 """
 
 import atexit
@@ -37,11 +37,11 @@ from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.rendering import renderer_string
 
 LOOK_STREAM = 0x100C5
-"""Sets the random numbers of variants' looks apart from all others."""
+"""Separates the random numbers of variants' looks from all others."""
 
 
 def _calibration(env: envs.SuturingEnv, view: str, size: int) -> dict[str, NDArray[np.float32]]:
-    """Return a view's nominal K (9,) and T_world_camera (16,) in the state that was set."""
+    """Return a view's nominal K (9,) and T_world_camera (16,) in the env's present state."""
     known = env.calibration
     return {
         names.intrinsics_key(view): known.intrinsics(view, (size, size)).astype(np.float32).ravel(),
@@ -53,8 +53,8 @@ def _calibration(env: envs.SuturingEnv, view: str, size: int) -> dict[str, NDArr
 def _env(
     config: str, views: tuple[str, ...], size: int, depth: bool, segmentation: bool
 ) -> envs.SuturingEnv:
-    """Return this process's environment; the one before is closed with its GL context."""
-    # The GL context must go before the interpreter does.
+    """Return this process's environment; the previous one is closed with its GL context."""
+    # The GL context must be freed before the interpreter exits.
     atexit.register(_env.cache_clear)
     return envs.make(
         from_mapping(TaskConfig, json.loads(config)),
@@ -80,7 +80,7 @@ def render_episode(
 ) -> None:
     """Write one episode's columns and images into `folder`; the job "render-episode".
 
-    `variants` are the fields of `variants.Variants`, `variant` is the number of one of them;
+    `variants` holds the fields of `variants.Variants`, `variant` is the number of one variant;
     `layout` is a key of `layouts.LAYOUTS`.
     """
     chosen = LAYOUTS[layout]
@@ -93,7 +93,7 @@ def render_episode(
             f"{demo} was recorded in another scene (hash {episode.scene_hash[:12]}, now "
             f"{env.scene.hash[:12]}); record it again with this version."
         )
-    # The images, frame by frame: encoded, counted and hashed; what the env measures beside them.
+    # Per frame: the encoded images, their statistics and digest, and what the env measures.
     keys = chosen.image_keys(views, depth, segmentation)
     content: dict[str, list[bytes]] = {key: [] for key, _, _ in keys}
     statistics = {key: ImageStatistics() for key in content}
@@ -108,7 +108,7 @@ def render_episode(
         assert isinstance(observation, dict)  # the env shows images
         for key, view, modality in keys:
             frame = observation[names.frame_key(view, modality)]
-            # LeRobot admits one-channel images as depth only.
+            # LeRobot accepts one-channel images only as depth.
             frame = np.repeat(frame, 3, axis=2) if modality == names.SEGMENTATION else frame
             if modality == names.RGB:
                 frame = shown.spoilt(frame, step * frame_stride, view)
@@ -120,7 +120,7 @@ def render_episode(
         for view in views:
             for key, matrix in _calibration(env, view, size).items():
                 measured[key].append(matrix)
-    # The columns, and everything in one file and its summary.
+    # The columns; then everything in one file, and a summary.
     unordered: dict[str, NDArray[np.generic]] = {
         **{key: np.stack(rows).astype(np.float32) for key, rows in measured.items()},
         **chosen.recorded(episode, frame_stride, env),
@@ -137,7 +137,7 @@ def render_episode(
             **{
                 key: column_statistics(values)
                 for key, values in columns.items()
-                if values.dtype.kind != "U"  # LeRobot has none of texts either
+                if values.dtype.kind != "U"  # LeRobot has no statistics of texts either
             },
         },
         "renderer": _renderer(),
@@ -148,12 +148,12 @@ def render_episode(
 
 @dataclass(frozen=True)
 class _Shown:
-    """How a variant is seen.
+    """The appearance of a variant.
 
     Attributes:
-        look: axis of randomisation → its numbers; empty leaves what was recorded.
-        strengths: corruption of its images → its strength.
-        seed: of the corruptions.
+        look: axis of randomisation → its numbers; empty keeps what was recorded.
+        strengths: corruption of its images → strength.
+        seed: seed of the corruptions.
     """
 
     look: Mapping[str, Sequence[float]] = MappingProxyType({})
@@ -162,7 +162,7 @@ class _Shown:
 
     @classmethod
     def drawn(cls, looks: Variants, demo: Demo, variant: int) -> "_Shown":
-        """Draw a variant from the states that were recorded and the variant's number."""
+        """Draw a variant from the recorded states and the variant's number."""
         recorded = int(hashlib.sha256(demo.state.tobytes()).hexdigest(), 16)
         rng = np.random.default_rng([LOOK_STREAM, recorded, variant])
         look = draw_look(looks.shown(TaskConfig()).randomisation, rng)
@@ -172,7 +172,7 @@ class _Shown:
         return cls(look, strengths, int(rng.integers(2**32)))
 
     def spoilt(self, image: Image, step: int, view: str) -> Image:
-        """Return an image (height, width, 3) as the corruptions leave it at a control step."""
+        """Return an image (height, width, 3) after the corruptions of a control step."""
         moment = Moment(self.seed, step, camera_number(view))
         for kind, strength in self.strengths.items():
             image = CORRUPTIONS[kind](image, strength, moment)
@@ -205,9 +205,9 @@ def _renderer() -> str:
 
 
 def _camera(view: str) -> Table:
-    """Return what a view is: the camera that takes it, and of a crop about which arm it lies.
+    """Return what a view is: its camera and, for a crop, the arm that it follows.
 
-    Where it stands and what it sees is in the dataset's calibration columns.
+    Its pose and intrinsics are in the dataset's calibration columns.
     """
     crop = crop_of(view)
     if crop is None:

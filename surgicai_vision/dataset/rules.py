@@ -1,4 +1,4 @@
-"""Rules for an episode of ours, for the check of a dataset and the repair of a broken one."""
+"""Rules that an episode of ours must follow, for checking a dataset and repairing a broken one."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -9,7 +9,7 @@ from surgicai_vision.core import names
 from surgicai_vision.dataset import schema
 
 MOVED = 0.001
-"""An arm or a needle that went further between two frames [m] must be seen to have moved."""
+"""If an arm or needle moves further than this between two frames [m], the image must change."""
 
 
 def episode_problems(
@@ -20,7 +20,7 @@ def episode_problems(
     Args:
         number: its index in the dataset.
         columns: its rows of `schema.COLUMNS`, `frame_index` and `timestamp`.
-        fps: frames a second.
+        fps: frames per second.
     """
     count = len(columns["frame_index"])
     steps = np.arange(count)
@@ -47,14 +47,14 @@ def number_problems(columns: Mapping[str, NDArray[np.generic]]) -> Iterator[str]
 
 
 class ImageWatch:
-    """Looks at one episode's images of one column, in order.
+    """Checks one episode's images of one column, in order.
 
     Args:
         key: the column.
         size: side of its images [px].
         views: the dataset's cameras.
         rows: the episode's columns.
-        lossless: not from a video, whose encoder may leave an image as it was.
+        lossless: not from a video, whose encoder may repeat an image unchanged.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class ImageWatch:
         rows: Mapping[str, NDArray[np.generic]],
         lossless: bool = True,
     ):
-        # A camera that moves along need not see what moved, and a part's outline can stay the same.
+        # A moving camera may not see what moved, and a part's outline can stay the same.
         still = [view for view in views if view in names.FIXED_CAMERAS]
         self._watched = lossless and key in {
             name(view) for view in still for name in (names.image_key, names.depth_key)
@@ -78,7 +78,7 @@ class ImageWatch:
         self._before: NDArray[np.uint8 | np.float32] | None = None
 
     def problem(self, index: int, frame: NDArray[np.uint8 | np.float32]) -> str:
-        """Return what is wrong with the episode's frame `index`, or nothing."""
+        """Return what is wrong with the episode's frame `index`, or ""."""
         problem = image_problem(frame, self._size)
         if self._before is not None and np.array_equal(frame, self._before):
             if self._watched and np.abs(self._shown[index] - self._last).max() > MOVED:
@@ -90,7 +90,7 @@ class ImageWatch:
 
 
 def image_problem(frame: NDArray[np.uint8 | np.float32], size: int) -> str:
-    """Return what is wrong with an image by itself, or nothing."""
+    """Return what is wrong with a single image, or ""."""
     if frame.shape[:2] != (size, size):
         return f"it is {frame.shape[0]} × {frame.shape[1]}, not {size} × {size}"
     if frame.dtype == np.float32 and not (np.isfinite(frame).all() and frame.min() > 0.0):

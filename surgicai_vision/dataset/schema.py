@@ -1,8 +1,8 @@
 """Features of our datasets, and the digest of their content.
 
-`features(views, size, …)` is the LeRobot feature table; `EpisodeDigest` hashes one episode's
-decoded images and columns in a fixed order, and `dataset_digest` the episodes in theirs, so that a
-dataset has one digest however it was compressed, split into files or rendered.
+`features(views, size, …)` is the LeRobot feature table. `EpisodeDigest` hashes one episode's
+decoded images and columns in a fixed order, and `dataset_digest` the episodes in order. A dataset's
+digest therefore does not depend on how it was compressed, split into files or rendered.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ from surgicai_vision.core import names
 from surgicai_vision.demos.store import Demo
 
 Table = Mapping[str, Any]
-"""A JSON object, as it is read from a file."""
+"""A JSON object, as read from a file."""
 
 FORMAT = 3
 """Version of `meta/surgicai.json`; surgicai-vision 0.1 wrote none, 2 had no set points."""
@@ -32,7 +32,7 @@ VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         names.PRIVILEGED_STATE: names.PRIVILEGED_NAMES,
     }
 )
-"""float32 columns → names of their elements: [m], [rad], unit quaternions; privileged [cm]."""
+"""float32 column → names of its elements: [m], [rad], unit quaternions; privileged state [cm]."""
 
 SCALARS: Mapping[str, str] = MappingProxyType(
     {
@@ -44,18 +44,18 @@ SCALARS: Mapping[str, str] = MappingProxyType(
         names.SEED: "int64",
     }
 )
-"""One-element columns → dtype; reward, done, success and contact are those after the action."""
+"""One-element column → dtype; reward, done, success and contact are those after the action."""
 
 COLUMNS = (*VECTORS, *SCALARS)
-"""The columns of every dataset that are no images, in the order of the digest."""
+"""The columns of every dataset that are not images, in the order of the digest."""
 
 SIZES = (16, 1024)
-"""Smallest and largest image side [px]; MuJoCo's off-screen buffer ends at the latter."""
+"""Smallest and largest image side [px]; the latter is the size of MuJoCo's off-screen buffer."""
 IMAGE_AXES = ("height", "width", "channels")
 
 
 def calibration_keys(views: Sequence[str]) -> dict[str, tuple[int, int]]:
-    """Return the key of every calibration column → the shape of its matrix."""
+    """Return key of every calibration column → shape of its matrix."""
     keys: dict[str, tuple[int, int]] = {}
     for view in views:
         keys[names.intrinsics_key(view)] = (3, 3)
@@ -69,7 +69,7 @@ def is_calibration(key: str) -> bool:
 
 
 def columns(views: Sequence[str]) -> tuple[str, ...]:
-    """Return every column of a dataset that is no image, in the order of the digest."""
+    """Return every column of a dataset that is not an image, in the order of the digest."""
     return (*COLUMNS, *calibration_keys(views))
 
 
@@ -87,7 +87,7 @@ def features(views: Sequence[str], size: int, depth: bool, segmentation: bool) -
     """Return the LeRobot feature table.
 
     A segmentation image is stored as RGB with the part's index in all three channels: LeRobot
-    admits one-channel images as depth only.
+    accepts one-channel images only as depth.
     """
     table = image_features(image_keys(views, depth, segmentation), size)
     for key, elements in VECTORS.items():
@@ -112,7 +112,7 @@ def image_features(keys: Iterable[tuple[str, str, str]], size: int) -> dict[str,
 
 
 def labels(demo: Demo, frame_stride: int) -> dict[str, NDArray[np.generic]]:
-    """Return the columns of `SCALARS` of each frame rendered, (frames,), as recorded."""
+    """Return the columns of `SCALARS` for the rendered frames, (frames,), as recorded."""
     frames = len(range(0, len(demo), frame_stride))
     return {
         names.REWARD: demo.reward[::frame_stride],
@@ -139,7 +139,7 @@ class ImageDigest:
         self._total = hashlib.sha256()
 
     def add(self, frame: NDArray[np.uint8 | np.float32]) -> None:
-        """Count the next frame (H, W, channels)."""
+        """Add the next frame (H, W, channels)."""
         self._total.update(str((frame.shape, frame.dtype.name)).encode())
         self._total.update(np.ascontiguousarray(frame))
 
@@ -149,18 +149,18 @@ class ImageDigest:
 
 
 class EpisodeDigest:
-    """sha256 over one episode: its columns in their order, then each image column."""
+    """sha256 over one episode: its columns in order, then each image column."""
 
     def __init__(self, keys: Iterable[str]):
         self._images = {key: ImageDigest() for key in keys}
         self._known: dict[str, str] = {}
 
     def add(self, key: str, frame: NDArray[np.uint8 | np.float32]) -> None:
-        """Count the next decoded frame (H, W, channels) of an image column."""
+        """Add the next decoded frame (H, W, channels) of an image column."""
         self._images[key].add(frame)
 
     def take(self, key: str, digest: str) -> None:
-        """Take an image column's `ImageDigest` in the place of its frames."""
+        """Use an image column's `ImageDigest` instead of its frames."""
         self._known[key] = digest
 
     def hexdigest(
@@ -173,8 +173,8 @@ class EpisodeDigest:
 
         Args:
             rows: its columns.
-            views: those of the dataset.
-            order: its columns' keys, by default those of `columns(views)`.
+            views: the dataset's views.
+            order: keys of its columns, by default those of `columns(views)`.
         """
         total = hashlib.sha256()
         for key in order or columns(views):

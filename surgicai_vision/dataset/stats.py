@@ -1,7 +1,8 @@
 """Statistics of one episode in LeRobot's form: min, max, mean, std, count and quantiles.
 
-Images stream through `ImageStatistics` one at a time, so memory is bounded; RGB counts every pixel
-(values in [0, 1] as LeRobot stores them), depth a fixed sixteenth of them [m]. Columns are exact.
+Images stream through `ImageStatistics` one at a time, so memory is bounded. RGB statistics use
+every pixel (values in [0, 1] as LeRobot stores them), depth statistics a fixed sixteenth of them
+[m]. Statistics of other columns are exact.
 """
 
 from typing import Any
@@ -14,7 +15,7 @@ QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 """LeRobot's quantiles (lerobot 0.6.1, datasets/compute_stats.py)."""
 
 DEPTH_STRIDE = 4
-"""Every fourth pixel of every fourth row of a depth image is counted."""
+"""Statistics of a depth image use every fourth pixel of every fourth row."""
 
 Statistics = dict[str, list[Any]]
 
@@ -28,7 +29,7 @@ class ImageStatistics:
         self._depths: list[NDArray[np.float32]] = []
 
     def add(self, frame: NDArray[np.uint8 | np.float32]) -> None:
-        """Count one frame."""
+        """Add one frame."""
         self._count += 1
         if frame.dtype == np.uint8:
             for channel in range(3):
@@ -38,7 +39,7 @@ class ImageStatistics:
             self._depths.append(frame[::DEPTH_STRIDE, ::DEPTH_STRIDE].ravel().astype(np.float32))
 
     def result(self) -> Statistics:
-        """Return the statistics; each of shape (channels, 1, 1), the count (1,)."""
+        """Return the statistics, each of shape (channels, 1, 1); the count is (1,)."""
         if self._depths:
             channels = [_column_statistics(np.concatenate(self._depths).astype(np.float64))]
         else:
@@ -48,7 +49,7 @@ class ImageStatistics:
 
 
 def column_statistics(values: NDArray[np.generic]) -> Statistics:
-    """Return the statistics of a column (T,) or (T, n); each of shape (n,), the count (1,)."""
+    """Return the statistics of a column (T,) or (T, n), each of shape (n,); the count is (1,)."""
     columns = values.reshape(len(values), -1).astype(np.float64).T
     rows = [_column_statistics(column) for column in columns]
     return {**{name: [row[name] for row in rows] for name in rows[0]}, "count": [len(values)]}
@@ -66,7 +67,7 @@ def _column_statistics(values: NDArray[np.float64]) -> dict[str, float]:
 
 
 def _histogram_statistics(histogram: NDArray[np.float64]) -> dict[str, float]:
-    """Return the statistics of values 0..255, divided by 255, from their counts."""
+    """Return the statistics of values 0..255, divided by 255, from their histogram."""
     levels = np.arange(256) / 255.0
     total = histogram.sum()
     present = levels[histogram > 0]

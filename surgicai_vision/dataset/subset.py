@@ -5,15 +5,15 @@
     subset = of_subtask(open_dataset(Path("outputs/datasets/suture")), "insert")
     features = features.part(subset.rows, subset.fingerprint)       # of the whole's features
 
-Of two sets of first episodes the smaller lies within the larger, so a learning curve adds episodes.
+A smaller set of first episodes is contained in a larger one, so a learning curve adds episodes.
 
-A frame stride is worth its name because neighbouring frames of 50 a second say nearly the same,
-while every episode brings a needle that lies elsewhere: for the same time of encoding and training,
-few frames of many episodes teach more than all frames of few (docs/results/scene-0.1.md).
+A frame stride pays off because neighbouring frames at 50 per second carry nearly the same
+information, while every episode has the needle in another place. For the same encoding and training
+time, few frames of many episodes teach more than all frames of few (docs/results/scene-0.1.md).
 
 A low-level policy is better trained on a subtask's frames of whole procedures than on
-demonstrations of the subtask alone, which end at the first success: in a whole procedure the
-subtask goes on until it is finished (`config.DWELL`), and it begins where the one before ended.
+demonstrations of the subtask alone, which end at the first success. In a whole procedure the
+subtask continues until it is finished (`config.DWELL`), and begins where the previous one ended.
 """
 
 import functools
@@ -44,16 +44,16 @@ def first_episodes(dataset: Dataset, count: int) -> "DatasetSubset":
 
 
 def with_frame_stride(dataset: Dataset, frame_stride: int) -> Dataset:
-    """Return the frames of the control steps 0, `frame_stride`, 2 · `frame_stride` … of an episode.
+    """Return each episode's frames at the control steps 0, `frame_stride`, 2 · `frame_stride`, ….
 
     Columns keep their values: `frame_index` still counts the frames of the whole.
 
     Args:
-        dataset: any dataset; it is returned itself where it holds no other frames.
+        dataset: any dataset; returned unchanged if it already has this stride.
         frame_stride: control steps from frame to frame, at least 1.
 
     Raises:
-        InputError: the dataset was rendered with fewer frames.
+        InputError: `frame_stride` is not a multiple of the stride the dataset was rendered with.
     """
     check_at_least(1, frame_stride=frame_stride)
     held = names.FPS // dataset.fps
@@ -75,14 +75,14 @@ def with_frame_stride(dataset: Dataset, frame_stride: int) -> Dataset:
 def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
     """Return a subtask's frames of a dataset of whole procedures, as a dataset of that subtask.
 
-    The subtask is the task of its configuration, with the subtask's step limit; `frame_index` and
-    `timestamp` count from the beginning of each visit: a run of frames of one phase in one episode.
-    A procedure that went back to a subtask (`demos.recovery_expert`) visits it more than once, and
-    a policy that is asked again starts its clock anew.
+    The task of its configuration is the subtask, with the subtask's step limit. `frame_index` and
+    `timestamp` count from the beginning of each visit, a run of frames of one phase in one episode.
+    A procedure that returns to a subtask (`demos.recovery_expert`) visits it more than once, and
+    the policy then restarts its clock.
 
     Raises:
         UnknownName: no subtask of that name.
-        InputError: a dataset of a single subtask, or one in which this one does not occur.
+        InputError: a dataset of a single subtask, or one in which this subtask does not occur.
     """
     check_name("subtask", subtask, names.SUBTASKS)
     if dataset.task != names.SUTURE:
@@ -100,10 +100,10 @@ def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
 
 
 def first_of_visit(rows: NDArray[np.int64], episode_index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for every selected row the position of the first one of its visit, (N,) int64.
+    """Return for every selected row the position of the first row of its visit, (N,) int64.
 
     Args:
-        rows: (N,) int64, rising: which frames of the whole are selected.
+        rows: (N,) int64, ascending: which frames of the whole are selected.
         episode_index: (N,) their episodes. A visit is a run of neighbouring rows of one episode.
     """
     begins = np.ones(len(rows), dtype=bool)
@@ -114,11 +114,11 @@ def first_of_visit(rows: NDArray[np.int64], episode_index: NDArray[np.int64]) ->
 
 @final
 class DatasetSubset:
-    """Some frames of a dataset; a `Dataset` itself.
+    """Some frames of a dataset; itself a `Dataset`.
 
     Attributes:
         whole: the dataset it is selected from.
-        rows: which frames of the whole it holds, (N,) int64, rising.
+        rows: which frames of the whole it holds, (N,) int64, ascending.
         path, views, policy_views, image_size: those of the whole.
         config: configuration of the task.
         task: name of the task.
@@ -141,13 +141,14 @@ class DatasetSubset:
 
         Args:
             whole: the dataset to select from.
-            rows: (N,) int64, rising.
-            selection: says in plain data which frames they are; part of the fingerprint.
+            rows: (N,) int64, ascending.
+            selection: describes the selected frames as plain data; part of the fingerprint.
             config: configuration of the task; the whole's by default.
             fps: frames per second; the whole's by default.
-            restart_time: let `frame_index` and `timestamp` begin anew in every run of neighbouring
-                rows of one episode.
-            added: columns that the whole does not have, (N,) or (N, n); `selection` says which.
+            restart_time: restart `frame_index` and `timestamp` in every run of neighbouring rows
+                of one episode.
+            added: columns that the whole does not have, (N,) or (N, n); `selection` must describe
+                them.
         """
         self.whole = whole
         self._selection = dict(selection)
@@ -183,7 +184,7 @@ class DatasetSubset:
         return episode_bounds(self.episode_index)
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
-        """Return every column that is no image, (N,) or (N, n), by its key."""
+        """Return every column that is not an image, (N,) or (N, n), by its key."""
         columns = {key: values[self.rows] for key, values in self.whole.columns().items()}
         if self._restart_time:
             first = first_of_visit(self.rows, self.episode_index)
@@ -201,7 +202,7 @@ class DatasetSubset:
                 f"{self.length}."
             )
         rows = self.rows[start:stop]
-        # Neighbouring frames are read at once, in order.
+        # Neighbouring frames are read together, in order.
         runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
         parts = [self.whole.frames(view, int(run[0]), int(run[-1]) + 1) for run in runs if len(run)]
         return np.concatenate(parts) if parts else self.whole.frames(view, 0, 0)

@@ -1,6 +1,6 @@
-"""Videos of a LeRobot dataset: frames by their number, written and read with PyAV.
+"""Videos of a LeRobot dataset: frames by number, written and read with PyAV.
 
-A policy reads at random: every second frame is a key frame.
+Every second frame is a key frame, because policies read frames in random order.
 """
 
 from collections.abc import Iterator
@@ -24,16 +24,16 @@ CODECS = MappingProxyType(
         "av1": ("libsvtav1", {"g": "2", "crf": "30", "preset": "12"}),
     }
 )
-"""Codec → (encoder, options): LeRobot's defaults (lerobot 0.6.1, configs/video.py), but that
+"""Codec → (encoder, options): LeRobot's defaults (lerobot 0.6.1, configs/video.py), except that
 the same frames give the same bytes."""
 
 PIXELS = "yuv420p"
 AV1_SIZE = 32
-"""Smallest side of the images of an av1 video [px]: SVT-AV1 ends the process at 24 px and less."""
+"""Smallest image side of an av1 video [px]: SVT-AV1 kills the process at 24 px or less."""
 
 
 class VideoWriter:
-    """A video file in the making.
+    """A video file that is being written.
 
     Attributes:
         written: bytes encoded so far.
@@ -46,11 +46,11 @@ class VideoWriter:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._container = av.open(str(path), "w")
         stream = self._container.add_stream(name, rate=fps, options=dict(options))
-        assert isinstance(stream, av.VideoStream)  # as CODECS has it
+        assert isinstance(stream, av.VideoStream)  # CODECS names video encoders only
         stream.width = size
         stream.height = size
         stream.pix_fmt = PIXELS
-        with kept_schedule():  # SVT-AV1 changes it where it runs as root
+        with kept_schedule():  # SVT-AV1 changes it when running as root
             stream.codec_context.open()
         self._stream = stream
         self.written = 0
@@ -63,7 +63,7 @@ class VideoWriter:
         self._mux(self._stream.encode(image))
 
     def close(self) -> None:
-        """Write what the encoder still holds and the file's index."""
+        """Write the remaining frames of the encoder, and the file's index."""
         self._mux(self._stream.encode())
         self._container.close()
 
@@ -86,7 +86,7 @@ def read_frames(
     """Yield the frames first … first + count - 1 of a video, each (H, W, 3) uint8 RGB.
 
     Raises:
-        BadFile: it cannot be decoded, or a frame is missing.
+        BadFile: the video cannot be decoded, or a frame is missing.
     """
     import av
 
@@ -94,7 +94,7 @@ def read_frames(
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
-            # Decoding slices of so small a frame in threads costs more than it brings.
+            # For such small frames, decoding slices in threads costs more than it gains.
             stream.thread_type = "NONE"
             if first and stream.time_base:
                 container.seek(int(first / fps / stream.time_base), stream=stream)
@@ -117,7 +117,7 @@ def read_frames(
 
 
 def count_frames(path: Path) -> int:
-    """Return the number of frames in a video by its packets; 0 where it cannot be read."""
+    """Return the number of frames in a video, from its packets; 0 if it cannot be read."""
     import av
 
     count = 0

@@ -1,7 +1,7 @@
 """Encode a dataset's images as videos, one job for each view and block of episodes.
 
-A block is a video file of its own. Blocks depend on the dataset alone, so the files are the same
-for any number of workers. Every frame is decoded again and compared with its image.
+Each block becomes one video file. Blocks depend only on the dataset, so the files are the same for
+any number of workers. Every frame is decoded again and compared with its image.
 """
 
 import functools
@@ -22,13 +22,13 @@ from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.video import VideoWriter, read_frames
 
 BLOCK_FRAMES = 2000
-"""Frames of a block, at least, but for the last: some 10 MB of video, half a minute of one core."""
+"""Minimum frames of every block but the last: some 10 MB of video, half a minute of one core."""
 VIDEO_FILE = "video.mp4"
 COMPARISON_FILE = "comparison.json"
 """Digest and error of every episode of a block."""
 
 Place = tuple[int, float, float]
-"""(number of the video file, first second, second after the last)."""
+"""(number of the video file, begin [s], end [s])."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Encoded:
     """One view of one episode, encoded.
 
     Attributes:
-        place: where it is in the view's videos.
+        place: its place in the view's videos.
         digest: sha256 (hex) of its decoded frames, as `schema.EpisodeDigest` takes it.
         error: sum over its frames of the mean absolute error, out of 255.
     """
@@ -55,14 +55,14 @@ def encode_views(
     context: RunContext,
     progress: Progress,
 ) -> list[dict[str, Encoded]]:
-    """Encode some views of a dataset; return every episode's videos by their keys.
+    """Encode some views of a dataset; return every episode's videos by image key.
 
     Args:
         dataset: a dataset of images.
-        folder: gets `videos/`.
+        folder: the folder in which `videos/` is written.
         views: cameras.
         video: codec, a key of `video.CODECS`.
-        store: folder of the jobs' results.
+        store: folder for the jobs' results.
         context: workers and engine.
         progress: counts the frames of all views.
     """

@@ -2,12 +2,12 @@
 
     assemble(shards, out, features, text, meta)
 
-The episodes' parquet files are copied row group by row group into data files of at most 100 MB,
-with the index columns filled in, and LeRobot's metadata is written beside them. Memory holds one
+The episodes' parquet files are copied into data files of about 100 MB, one row group per episode,
+with the index columns filled in, and LeRobot's metadata is written next to them. Memory holds one
 episode. The folder appears under its name when it is complete.
 
 LeRobot's own `aggregate_datasets` reads and rewrites the growing file for every episode: 7 to 20 ms
-a frame of two views with depth, where this takes below one.
+per frame of two views with depth, where this takes less than one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ from surgicai_vision.dataset.stats import Statistics, column_statistics
 EPISODE_FILE = "episode.parquet"
 """Columns and images of a rendered episode, in its own folder."""
 SUMMARY_FILE = "summary.json"
-"""Statistics, digest and cameras of a rendered episode, beside `EPISODE_FILE`."""
+"""Statistics, digest and cameras of a rendered episode, next to `EPISODE_FILE`."""
 
 
 def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, meta: Table) -> None:
@@ -45,8 +45,8 @@ def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, m
         out: dataset folder; it does not exist yet.
         features: LeRobot feature table.
         text: the task's sentence.
-        meta: content of `meta/surgicai.json`; its `fps` is that of the frames, its `robot_type`,
-            where there is one, LeRobot's.
+        meta: content of `meta/surgicai.json`; its `fps` and, if present, its `robot_type` also go
+            into LeRobot's metadata.
     """
     with whole_folder(out) as folder:
         data = DataFiles(folder, features, meta["fps"])
@@ -63,8 +63,8 @@ def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, m
 def compression(schema: pa.Schema, depth: Sequence[str]) -> dict[str, str]:
     """Return the codec of every parquet column; `depth` names the columns of depth images.
 
-    PNG is compressed already; raw float32 TIFF is not, and zstd's first level makes it a tenth in
-    0.3 ms.
+    PNG is already compressed; raw float32 TIFF is not, and zstd's first level shrinks it to a tenth
+    in 0.3 ms.
     """
     codecs = {}
     for field in schema:
@@ -79,13 +79,13 @@ def compression(schema: pa.Schema, depth: Sequence[str]) -> dict[str, str]:
 
 
 def column_array(values: NDArray[np.generic]) -> pa.Array:
-    """Return a column (T,) or (T, n) as Arrow scalars or lists of fixed size."""
+    """Return a column (T,) or (T, n) as Arrow scalars or fixed-size lists."""
     flat = pa.array(np.ascontiguousarray(values).ravel())
     return pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat
 
 
 class DataFiles:
-    """The growing data files of a dataset in `folder`: one row group an episode."""
+    """The growing data files of a dataset in `folder`: one row group per episode."""
 
     def __init__(self, folder: Path, features: Features, fps: float = names.FPS):
         self._folder = folder
@@ -104,9 +104,9 @@ class DataFiles:
         """Write one episode and return its metadata.
 
         Args:
-            index: its number; the index columns are made from it.
-            episode: its rows; `task_index` is 0 where they have none.
-            statistics: those of the other columns.
+            index: the episode's number, from which the index columns are made.
+            episode: its rows; `task_index` is 0 if they have none.
+            statistics: the statistics of the other columns.
         """
         count = len(episode)
         start = self._frames
@@ -132,7 +132,7 @@ class DataFiles:
         return EpisodeMetadata(start, self._frames, self._file, {**statistics, **own})
 
     def _present(self) -> pq.ParquetWriter:
-        """Return the writer of the present data file; a new one when the last is full."""
+        """Return the writer of the current data file; a new one when the last is full."""
         if self._writer is None or self._bytes >= DATA_FILE_MB * 2**20:
             self.close()
             self._file += 1

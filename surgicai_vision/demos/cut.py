@@ -1,18 +1,18 @@
-"""Cut: the visits of a subtask in recordings of whole procedures, as demonstrations of its own.
+"""Cut: a subtask's visits in recordings of whole procedures, as demonstrations of the subtask.
 
     cut_demos(Path("demos/recover"), "grasp", out=Path("demos/grasp-visits"))
 
 A visit is a run of control steps of one phase. A procedure that goes back to a subtask
-(`demos.recovery_expert`) visits it more than once, and begins it where no start of the subtask on
-its own does: over a needle that was dropped, with a needle that is in the tissue already. Rendered
-together with demonstrations of the subtask's own (`render-demos --demos A,B`), visits teach its
-policy what to do there.
+(`demos.recovery_expert`) visits it more than once, and begins some visits in states that none of
+the subtask's own starts has: over a dropped needle, or with a needle that is already in the tissue.
+Rendered together with the subtask's own demonstrations (`render-demos --demos A,B`), visits teach
+its policy what to do there.
 
-What is left out of a visit that was broken off: everything after the jaws last touched the needle,
-for there the demonstrator had not noticed the loss yet (`record-demos --late`); and visits of fewer
-than `SHORTEST` steps.
+A visit that was broken off is kept up to the last contact of the jaws with the needle: after that
+the demonstrator had not yet noticed the loss (`record-demos --late`). Visits of fewer than
+`SHORTEST` steps are left out.
 
-The folder is written whole; the same request finds it finished.
+The folder is written atomically; repeating the same request reuses it.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ from surgicai_vision.demos.store import (
 )
 
 SHORTEST = 5
-"""Control steps of the shortest visit that is kept: one frame, at the stride policies see."""
+"""Control steps of the shortest visit that is kept: one frame at the stride that policies see."""
 
 
 def cut_demos(demos: Path, subtask: str, *, out: Path, stage: Stage = silent_stage) -> list[Path]:
@@ -48,7 +48,7 @@ def cut_demos(demos: Path, subtask: str, *, out: Path, stage: Stage = silent_sta
     Args:
         demos: folder of demonstrations of the whole procedure.
         subtask: one of `names.SUBTASKS`.
-        out: folder to make; the same request finds it finished.
+        out: folder to create; repeating the same request reuses it.
         stage: shows progress.
 
     Raises:
@@ -111,7 +111,7 @@ def visits(demo: Demo, subtask: str) -> list[Demo]:
 
 
 def _kept_end(demo: Demo, first: int, end: int) -> int:
-    """Return the step after the last that is kept of a visit, whose steps are `first` to `end`."""
+    """Return the step after the last one that is kept of the visit [first, end)."""
     is_broken_off = end < len(demo) and demo.phase[end] < demo.phase[first]
     if not is_broken_off:
         return end

@@ -1,10 +1,10 @@
-"""Demonstrators: what labels the states of a rollout, and acts there unless something else does.
+"""Demonstrators: they label the states of a rollout, and act there unless something else does.
 
     demonstrator = make_demonstrator("expert", env)
     env.step(demonstrator.action())
 
-A `Demonstrator` looks at the env's whole state, privileged as it is. In DAgger a `BehaviourPolicy`
-acts in its place for a while; the labels stay the demonstrator's.
+A `Demonstrator` reads the env's whole, privileged state. In DAgger a `BehaviourPolicy` acts instead
+of it for a while; the labels remain the demonstrator's.
 """
 
 from abc import ABC, abstractmethod
@@ -23,23 +23,23 @@ if TYPE_CHECKING:
 
 
 class Demonstrator(ABC):
-    """Labels the states of one episode; made anew for every episode.
+    """Labels the states of one episode; a new one is created for every episode.
 
     Attributes:
-        late: control steps by which it notices late that something was lost, for one that goes back
-            to it (`Disturbance.late`).
+        late: by how many control steps it notices a loss late, if it is a demonstrator that goes
+            back (`Disturbance.late`).
     """
 
     late: int = 0
 
     @property
     def persists(self) -> bool:
-        """Return True if an episode goes on after its success, until its limit."""
+        """Return True if an episode continues after its success, up to its limit."""
         return False
 
     @property
     def gives_up(self) -> str:
-        """Return why the demonstrator knows no way on, or ""; the episode ends as a failure."""
+        """Return why the demonstrator cannot continue, which fails the episode, or ""."""
         return ""
 
     @property
@@ -53,7 +53,7 @@ class Demonstrator(ABC):
 
 
 class BehaviourPolicy(ABC):
-    """Acts in the demonstrator's place at first, while the labels stay the demonstrator's."""
+    """Acts instead of the demonstrator at first; the labels remain the demonstrator's."""
 
     @abstractmethod
     def reset(self, env: "SuturingEnv", seed: int, rng: np.random.Generator) -> None:
@@ -61,7 +61,7 @@ class BehaviourPolicy(ABC):
 
     @abstractmethod
     def action(self, env: "SuturingEnv", observation: "Observation") -> NDArray[np.float32] | None:
-        """Return the action that is executed, (7,), or None once the demonstrator acts itself."""
+        """Return the action to execute, (7,), or None once the demonstrator acts itself."""
 
 
 DEMONSTRATORS: Mapping[str, str] = MappingProxyType(
@@ -79,15 +79,15 @@ LEARNING_DEMONSTRATORS = frozenset({"dmp", "multiply"})
 """Those that learn from demonstrations, which their class takes as a second argument."""
 
 CHOOSING_DEMONSTRATORS = frozenset({"multiply"})
-"""Those that take one of them an episode; how is their class's third argument."""
+"""Those that take one demonstration per episode; their class's third argument says how."""
 
 NEAREST = "nearest"
 RANDOM = "random"
 SOURCES = (NEAREST, RANDOM)
-"""How a choosing demonstrator takes one: that whose start was most alike, or any."""
+"""How a choosing demonstrator takes one: the one with the most similar start, or any."""
 
 GOAL_FREE_DEMONSTRATORS = frozenset({"search"})
-"""Those that do not know which point of the needle a grasp is asked for, and try several."""
+"""Those that do not know at which point of the needle a grasp is requested, and try several."""
 
 SCRIPTED_DEMONSTRATORS = tuple(name for name in DEMONSTRATORS if name not in LEARNING_DEMONSTRATORS)
 
@@ -101,10 +101,10 @@ def make_demonstrator(
         name: a key of `DEMONSTRATORS`.
         env: the env.
         demos: files of the demonstrations that a learning demonstrator learns from.
-        source: how a choosing one takes one of them an episode; "" for its default.
+        source: how a choosing demonstrator takes one of them per episode; "" for its default.
 
     Raises:
-        UnknownName: no demonstrator is called so.
+        UnknownName: no demonstrator has that name.
     """
     kind = resolve(DEMONSTRATORS[check_name("demonstrator", name, DEMONSTRATORS)])
     arguments = [*([demos] if demos else []), *([source] if source else [])]

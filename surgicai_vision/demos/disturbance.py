@@ -1,6 +1,6 @@
-"""Disturbance: what makes a demonstrator meet states off its own path; light to import.
+"""Disturbance: what makes a demonstrator meet states off its own path; cheap to import.
 
-`surgicai_vision.demos.rollout` says what each kind is for, and runs an episode with it.
+`surgicai_vision.demos.rollout` explains what each kind is for, and runs an episode with it.
 """
 
 from dataclasses import dataclass
@@ -24,18 +24,19 @@ class Disturbance:
 
     Attributes:
         noise: standard deviation of the Gaussian noise on the six motions of an executed action, in
-            units of its range; the jaw has its own.
+            units of its range; the jaw's noise is separate.
         perturb_start_fraction: share of episodes that start with a motion in a random direction,
             which is not recorded.
         noise_from: lowest deviation; each episode draws its own between this and `noise`. None
-            takes `noise` throughout.
+            uses `noise` throughout.
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
         jaw_noise: standard deviation of the noise on the jaw's motion, in units of its range, while
-            it is not told to close: a random walk of closed jaws would drop the needle. Without it
-            open jaws are always as far open as the demonstrator has them, and nothing shows a
-            policy whose jaws have closed a little how to open them again (docs/results/unmoved.md).
-        late: most control steps by which a demonstrator that goes back notices a loss late; each
-            episode draws its own. It shows what a policy looks like that has not noticed yet.
+            it is not commanded to close: a random walk of closed jaws would drop the needle.
+            Without this noise, open jaws are always exactly as open as the demonstrator holds them,
+            and a policy never sees how to reopen jaws that have closed a little
+            (docs/results/unmoved.md).
+        late: the most control steps by which a demonstrator that goes back notices a loss late;
+            each episode draws its own. It shows the behaviour of a policy that has not noticed yet.
     """
 
     noise: float = 0.0
@@ -83,17 +84,17 @@ class Disturbance:
         return float(rng.uniform(self.noise_from, self.noise))
 
     def draw_late(self, rng: np.random.Generator) -> int:
-        """Return by how many control steps a loss is noticed late in an episode."""
+        """Return by how many control steps an episode's demonstrator notices a loss late."""
         return int(rng.integers(0, self.late, endpoint=True)) if self.late else 0
 
     def disturb(
         self, action: NDArray[np.float32], deviation: float, rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        """Return what is executed in the place of `action`, (7,).
+        """Return what is executed instead of `action`, (7,).
 
         Args:
             action: the demonstrator's, (7,) in [-1, 1]; at -1 the jaw closes.
-            deviation: what `draw_deviation` gave for the episode.
+            deviation: what `draw_deviation` returned for the episode.
             rng: the source of the noise.
         """
         noisy = action + np.append(rng.normal(0.0, deviation, 6), 0.0)
@@ -106,14 +107,14 @@ class Disturbance:
 UNDISTURBED = Disturbance()
 
 RETURNING_DEMONSTRATORS = ("recover",)
-"""Those that go back to what was lost, and so can notice it late."""
+"""Those that go back after a loss, and so can notice it late."""
 
 
 def check_late(demonstrator: str, disturbance: Disturbance) -> None:
-    """Refuse a late notice of a demonstrator that notices no loss.
+    """Refuse late noticing for a demonstrator that notices no loss.
 
     Raises:
-        InputError: such a demonstrator is to be late.
+        InputError: `late` is set for such a demonstrator.
     """
     if disturbance.late and demonstrator not in RETURNING_DEMONSTRATORS:
         raise InputError(

@@ -1,12 +1,12 @@
-"""Expert: a scripted policy for every subtask and for the whole, in the env's own actions.
+"""Expert: a scripted policy for every subtask and the whole procedure, in the env's own actions.
 
-`Expert(env).action()` reads the env's present state, privileged as it is, and returns the next
-action, (7,) float32. It keeps nothing between calls, so it labels any state: of its own episodes,
-of a learner's (DAgger), or a restored one. It has the same seven numbers as a policy; it neither
-teleports the tool nor applies forces.
+`Expert(env).action()` reads the env's present, privileged state and returns the next action, (7,)
+float32. It keeps no state between calls, so it can label any state: of its own episodes, of a
+learner's (DAgger), or a restored one. Its actions are the same seven numbers as a policy's; it
+neither teleports the tool nor applies forces.
 
-Each subtask's rule returns where the commanded tool should be next; `action_towards` makes that one
-action, scaled as a whole so that translation and rotation stay in step on curved paths.
+Each subtask's rule returns where the commanded tool should be next. `action_towards` turns that
+into one action, scaled as a whole so that translation and rotation stay in step on curved paths.
 """
 
 import functools
@@ -46,26 +46,25 @@ OPEN_HANDOFF = 0.18
 """Jaw angles wide enough for the needle and narrow enough for its neighbours [rad]."""
 ALIGNED = 0.0006
 ALIGNED_ANGLE = math.radians(4.0)
-"""Off by less than this the jaws are lined up [m, rad]."""
+"""Jaws that are off by less than this are lined up [m, rad]."""
 CLOSING = 0.002
 CLOSING_ANGLE = math.radians(20.0)
-"""Off by less than this, jaws that are closing go on closing [m, rad]."""
+"""Closing jaws that are off by less than this go on closing [m, rad]."""
 CLEAR = 0.004
-"""Height of the needle's lowest point over the tissue at which it may turn and travel [m]."""
+"""Height of the needle's lowest point above the tissue at which it may turn and travel [m]."""
 LIFT = 0.01
-"""How far above its place the tool is sent to lift the needle [m]; where no joint limit is in the
-way."""
+"""How far up the tool is commanded to lift the needle [m], where no joint limit is in the way."""
 OUTSIDE = 0.006
-"""How far before the entry the tip gets into line [m]."""
+"""Distance before the entry at which the tip lines up [m]."""
 DRIVE = math.radians(1.8)
 """Rotation of the needle per control step on the circle [rad]."""
 LEAD = math.radians(9.0)
-"""Furthest the command may run ahead of the needle [rad]."""
+"""Largest angle by which the command may run ahead of the needle [rad]."""
 BLOCKED = 0.001
 """A needle this far off its path [m] is blocked: in `3dmed_straight` PSM2's wrist touches the
 ridge's steep flank."""
 WAYPOINTS = (0.2, 0.4, 0.6, 0.8, 1.0)
-"""Shares of a straight way at which its joints are checked."""
+"""Shares of a straight path at which its joints are checked."""
 HANDOFF_OFFSET = math.radians(4.0)
 """The expert grasps the needle a little nearer to the tip than the goal, away from the tissue."""
 
@@ -89,7 +88,7 @@ class Expert(Demonstrator):
         env: the env.
         noise: standard deviation of Gaussian noise on the six motions of an action, in units of its
             range; the jaw has none. The expert recovers from where the noise took it, so a
-            recording has states off the path.
+            recording includes states off the path.
         rng: source of the noise; needed with it.
 
     Raises:
@@ -122,7 +121,7 @@ class Expert(Demonstrator):
 
 
 class WorldState:
-    """The present state as the expert needs it: measured poses in world, (4, 4) matrices.
+    """The present state as the expert needs it: measured poses in the world frame, (4, 4) matrices.
 
     Attributes:
         arm: the active arm.
@@ -133,8 +132,8 @@ class WorldState:
         instrument: its instrument.
         needle: T_world_needle.
         tip: T_world_tip of the active arm.
-        told: what the active arm is commanded to, in its own view.
-        command: T_world_tip that this really is.
+        told: the active arm's command, in the arm's own view.
+        command: T_world_tip that this command really means.
         command_jaw: commanded jaw angle [rad].
         holds: whether the active arm's jaws hold the needle.
     """
@@ -161,21 +160,21 @@ class WorldState:
 
     @property
     def needle_line(self) -> Matrix:
-        """Return points of the needle from base to tip in its frame, (13, 3) [m]."""
+        """Return points of the needle from base to tip in the needle's frame, (13, 3) [m]."""
         return needle.polyline(13, self.stitch.radius, self.stitch.tip_angle)
 
     @property
     def commanded_needle(self) -> Matrix:
-        """Return where the held needle would be if the tool were where it is told to be."""
+        """Return where the held needle would be if the tool were at its commanded pose."""
         return self.command @ np.linalg.inv(self.tip) @ self.needle
 
 
 def action_towards(world: WorldState, target: ToolTarget) -> NDArray[np.float32]:
     """Return the action that moves the command towards `target`, scaled to at most 1 as a whole.
 
-    Closed jaws are closed with all of the range: the command stays at 0, and a policy that learns
-    from it may be off without letting go. (With a label of 0, its small errors add up: 7 of 50
-    learned placings dropped the needle.)
+    Jaws that should be closed get the full closing action. Their command stays at 0, and a policy
+    that learns this label can err without letting go. (With a label of 0, its small errors add up:
+    7 of 50 learned placings dropped the needle.)
     """
     way = command_error(world, target.tip)
     move = way / max(1.0, float(np.abs(way).max()))
@@ -190,7 +189,7 @@ def action_towards(world: WorldState, target: ToolTarget) -> NDArray[np.float32]
 
 
 def is_free(world: WorldState, way: Matrix) -> bool:
-    """Return True if no joint limit is in a straight way (6,) in step sizes from the command."""
+    """Return True if a straight way (6,) from the command, in step sizes, meets no joint limit."""
     steps = max(1.0, float(np.abs(way).max()))
     near = world.told.joints
     for share in (1.0 / steps, *WAYPOINTS):
@@ -204,9 +203,9 @@ def is_free(world: WorldState, way: Matrix) -> bool:
 
 
 def move_of_joints(world: WorldState, tip: Matrix, otherwise: Matrix) -> Matrix:
-    """Return a move (6,) in step sizes on the straight way of the joints to T_world_tip.
+    """Return a move (6,) in step sizes along the straight path in joint space to T_world_tip.
 
-    No joint limit is ever in that way. `otherwise` is returned where the pose cannot be reached.
+    That path never meets a joint limit. `otherwise` is returned if the pose cannot be reached.
     """
     to_base = np.linalg.inv(world.base)
     try:
@@ -228,20 +227,20 @@ def move_of_joints(world: WorldState, tip: Matrix, otherwise: Matrix) -> Matrix:
 
 
 def command_error(world: WorldState, tip: Matrix) -> Matrix:
-    """Return the way from the command to T_world_tip in step sizes and the base's axes, (6,)."""
+    """Return the move from the command to T_world_tip in step sizes and the base's axes, (6,)."""
     to_base = np.linalg.inv(world.base)
     return error_in_base(to_base @ world.command, to_base @ tip, world.step)
 
 
 def error_in_base(pose: Matrix, goal: Matrix, step: StepSize) -> Matrix:
-    """Return the way from T_base_tip `pose` to `goal` in step sizes and the base's axes, (6,)."""
+    """Return the move from T_base_tip `pose` to `goal` in step sizes and the base's axes, (6,)."""
     shift = (goal[:3, 3] - pose[:3, 3]) / step.translation
     turn = matrix_to_rotvec(goal[:3, :3] @ pose[:3, :3].T) / step.rotation
     return np.concatenate([shift, turn])
 
 
 def angle_between(a: Matrix, b: Matrix) -> float:
-    """Return the angle of the turn from one pose to the other [rad]."""
+    """Return the angle of the rotation from one pose to the other [rad]."""
     return float(np.linalg.norm(matrix_to_rotvec(a[:3, :3].T @ b[:3, :3])))
 
 
@@ -255,15 +254,15 @@ def _shifted(pose: Matrix, shift: Matrix) -> Matrix:
 
 
 def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: float) -> ToolTarget:
-    """Go before the grasp with open jaws, go in, close.
+    """Line up before the grasp with open jaws, move in, close.
 
     Args:
         world: the present state.
         goal: T_world_tip of the grasp.
-        back: how far before it the tool lines up [m].
+        back: how far before the grasp the tool lines up [m].
         opened: jaw angle on the way [rad].
     """
-    # Where the tool is relative to the grasp, along and beside the approach axis.
+    # Where the tool is relative to the grasp, along and across the approach axis.
     axis = goal[:3, 2]
     offset = world.tip[:3, 3] - goal[:3, 3]
     depth = float(offset @ axis)
@@ -271,7 +270,7 @@ def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: flo
     turned = angle_between(world.tip, goal)
     lined_up = beside < 2 * ALIGNED and turned < 2 * ALIGNED_ANGLE
     closing = world.command_jaw < opened - 2 * world.step.jaw
-    # Close, go in, or line up, whichever is due.
+    # Close, move in, or line up, whichever is due.
     if closing and beside < CLOSING and abs(depth) < CLOSING and turned < CLOSING_ANGLE:
         return ToolTarget(goal if not world.holds else world.command, 0.0)
     if beside < ALIGNED and abs(depth) < ALIGNED and turned < ALIGNED_ANGLE:
@@ -332,7 +331,7 @@ def turn_about_wound(start: Matrix, pose: Matrix) -> float:
 
 
 def _place(world: WorldState) -> ToolTarget:
-    """Lift the needle, turn it upright before the entry, bring its tip in."""
+    """Lift the needle, turn it upright before the entry, bring its tip into the entry."""
     goal = world.stitch.place()
     outward = world.stitch.pair.entry.rotation[:, 2]
     line = world.needle[:3, :3] @ world.needle_line.T + world.needle[:3, 3:4]
@@ -352,7 +351,7 @@ def _place(world: WorldState) -> ToolTarget:
 
 
 def _insert(world: WorldState) -> ToolTarget:
-    """Bring the tip in, then drive the needle along its path."""
+    """Bring the tip into the entry, then drive the needle along its path."""
     start = world.stitch.place()
     tip = (
         world.needle[:3, :3] @ needle.point(world.stitch.tip_angle, world.stitch.radius)
@@ -377,7 +376,7 @@ def _insert(world: WorldState) -> ToolTarget:
 def _drive(world: WorldState, turned: float, last: float) -> ToolTarget:
     """Move the needle along its path, up to the turn `last` [rad].
 
-    Once it is through and off the path it is pressed no further.
+    Once it is through both holes but off the path, it is pressed no further.
     """
     start = world.stitch.place()
     commanded = turn_about_wound(start, world.commanded_needle)
@@ -412,7 +411,7 @@ def _wrap(angle: float) -> float:
 
 @functools.cache
 def _rule(subtask: Subtask) -> Callable[[WorldState], ToolTarget]:
-    """Return a subtask's rule: ours, or the one that another distribution's task names."""
+    """Return a subtask's rule: ours, or the one named by another distribution's task."""
     if subtask.name in _RULES:
         return _RULES[subtask.name]
     if not subtask.expert:

@@ -2,8 +2,8 @@
 
     record(TaskConfig("grasp"), episodes=50, seed=0, out=Path("demos"))
 
-Seeds are taken in order from the first one; a seed at which the demonstrator fails is noted as
-skipped in `demos.json` and the next one is taken, so what is kept depends on the seeds alone. The
+Seeds are used in order from the first one. A seed at which the demonstrator fails is listed as
+skipped in `demos.json` and the next one is used, so what is kept depends only on the seeds. The
 same command continues a run that was killed (the finished episodes are in `<out>.work` until the
 folder is complete) and does nothing when it is complete. `surgicai_vision.demos.rollout` runs one
 episode.
@@ -60,14 +60,14 @@ if TYPE_CHECKING:
     from surgicai_vision.envs.base import SuturingEnv
 
 MAX_FAILURES = 3
-"""Seeds tried per episode wanted, at most: one success in three is the least to learn from."""
+"""Most seeds tried per requested episode: one success in three is the lowest usable rate."""
 LABELS = ("demos", "learner")
-"""Arguments of a job that say where a file is, not what it holds; its key leaves them out."""
+"""Arguments of a job that give a file's location, not its content; the job's key omits them."""
 
 
 @dataclass(frozen=True)
 class Learner:
-    """A policy that acts in the demonstrator's place at first.
+    """A policy that acts instead of the demonstrator at first.
 
     Attributes:
         folder: its checkpoint folder.
@@ -88,7 +88,7 @@ def _env(config: TaskConfig) -> "SuturingEnv":
 
 @job("record-episode", stages=("scene", "envs", "demos"))
 def record_episode(folder: Path, task: Mapping[str, JSON], **arguments: Any) -> None:
-    """Run one seed; the arguments are the rest of those of `record_into`."""
+    """Run one seed; `arguments` are the remaining ones of `record_into`."""
     record_into(folder, _env(from_mapping(TaskConfig, task)), **arguments)
 
 
@@ -150,23 +150,23 @@ def record(
     Args:
         config: task and scene.
         episodes: how many to keep.
-        out: folder to make; the same request continues it or finds it finished.
+        out: folder to create; repeating the same request continues or reuses it.
         demonstrator: a key of `DEMONSTRATORS`.
-        seed: first seed; the following ones are taken in order, training starts all of them.
+        seed: first seed; the following ones are used in order, all of them training starts.
         disturbance: noise, perturbed starts and upsets.
         post_success_steps: control steps recorded after an episode's success.
         demos: files of the demonstrations that a demonstrator in `LEARNING_DEMONSTRATORS` learns
             from; their seeds are left out.
-        source: how a demonstrator in `CHOOSING_DEMONSTRATORS` takes one of them an episode; "" for
+        source: how a demonstrator in `CHOOSING_DEMONSTRATORS` takes one of them per episode; "" for
             its default.
-        learner: acts until a step drawn by chance, while the labels stay the demonstrator's.
+        learner: acts until a randomly drawn step; the labels remain the demonstrator's.
         context: workers, engine and display.
 
     Raises:
         InputError: fewer than one episode, a negative seed or post_success_steps, starts that
-            are kept for validation or tests, an unknown
-            demonstrator, demonstrations for a demonstrator that learns from none, or none for one
-            that does, a source for one that chooses none; upsets in a task that has none.
+            are reserved for validation or tests, an unknown demonstrator, demonstrations for a
+            demonstrator that does not learn from any, none for one that does, a source for one
+            that chooses no demonstration, or upsets in a task that has none.
         OutputExists: `out` holds something else.
         SurgicaiError: the demonstrator failed at too many seeds.
     """
@@ -181,8 +181,8 @@ def record(
     check_late(demonstrator, disturbance)
     if disturbance.upset_fraction:
         check_upset_task(config.task)
-    # What decides the result: a finished folder of the same request is left as it is. What is not
-    # asked for is left out, so that a folder stays the same request's when an option is added.
+    # What determines the result: a finished folder of the same request is left as it is. Unused
+    # options are omitted, so that a folder still matches its request when an option is added.
     request = {
         "task": to_mapping(config),
         "demonstrator": demonstrator,
@@ -216,13 +216,13 @@ def record(
 
 
 def _sources(kept: Sequence[Path]) -> dict[str, list[str]]:
-    """Return the sha256 of each kept episode's source demonstration, where they have such."""
+    """Return the sha256 of each kept episode's source demonstration, if the episodes have one."""
     results = [read_json(path.parent / "result.json") for path in kept]
     return {"sources": [row["source"] for row in results]} if "source" in results[0] else {}
 
 
 def _check_demos(demonstrator: str, demos: Sequence[Path], source: str) -> None:
-    """Refuse a learning demonstrator without demonstrations, others with some, a source in vain."""
+    """Refuse a learning demonstrator without demonstrations, others with some, an unused source."""
     if demonstrator in LEARNING_DEMONSTRATORS and not demos:
         raise InputError(
             f"Demonstrator '{demonstrator}' learns from demonstrations; "
@@ -243,7 +243,7 @@ def _check_demos(demonstrator: str, demos: Sequence[Path], source: str) -> None:
 
 
 def _disturbance_fields(disturbance: Disturbance) -> dict[str, float]:
-    """Return the fields of a disturbance that differ from none at all, for a request."""
+    """Return the fields in which a disturbance differs from `UNDISTURBED`, for a request."""
     undisturbed = dataclasses.asdict(UNDISTURBED)
     fields = dataclasses.asdict(disturbance)
     return {name: value for name, value in fields.items() if value != undisturbed[name]}
@@ -274,10 +274,10 @@ def _run_seeds(
     run_jobs: Callable[..., list[Path]],
     progress: Progress,
 ) -> tuple[list[Path], list[dict[str, Any]], dict[str, dict[str, int]]]:
-    """Try seeds in order until enough succeeded.
+    """Try seeds in order until enough have succeeded.
 
     Returns:
-        The kept files; the skipped seeds; and each kind of upset with how many episodes had it
+        The kept files; the skipped seeds; and for each kind of upset how many episodes had it
         (`episodes`) and how many of them succeeded (`recovered`).
     """
     kept: list[Path] = []
@@ -295,7 +295,7 @@ def _run_seeds(
     if learner:
         shared["learner"] = str(learner.folder.resolve())
         inputs = (*inputs, learner.digest)
-    # The next seeds, without those of the demonstrations that are learned from.
+    # The next seeds, without those of the demonstrations used for learning.
     known = {read_demo(path).seed for path in demos}
     bank = range(request["seed"], names.VALIDATION_SEED)
     seeds = (seed for seed in bank if seed not in known)
@@ -307,7 +307,7 @@ def _run_seeds(
                 f"{len(kept) + len(skipped)} starts of {request['task']['task']}; "
                 f"{wanted} were wanted ({reasons}; …)."
             )
-        # As many seeds as episodes are missing; those that fail are made up for in the next turn.
+        # As many seeds as there are missing episodes; failed ones are replaced in the next round.
         jobs = [
             Job(
                 "drive-episode" if learner else "record-episode",
@@ -340,7 +340,7 @@ def _run_seeds(
 def _report_all(
     progress: Progress, before: int, wanted: int, done: int, total: int, unit: str = ""
 ) -> None:
-    """Report the progress of one batch of seeds as that of the whole."""
+    """Report the progress of one batch of seeds as progress of the whole recording."""
     progress(before + done, wanted, "episodes")
 
 

@@ -1,27 +1,27 @@
 """Recovery expert: the expert of the whole procedure that notices a loss and goes back.
 
-After every upset (`envs.upset`) it goes on from where the needle then is:
+After every upset (`envs.upset`) it continues from where the needle then is:
 
-| lost | noticed by | goes back to |
+| what went wrong | noticed by | goes back to |
 |---|---|---|
-| the needle slid or was pushed before its grasp | nothing: the grasp's rule follows it | – |
+| the needle slid or was pushed before its grasp | not needed: the grasp's rule follows it | – |
 | PSM2 no longer holds it, placing or inserting | `LOST` control steps without both pads | grasp |
-| PSM1 missed it, PSM2 or the tissue still holds it | nothing: the rule tries again | – |
+| PSM1 missed it, PSM2 or the tissue still holds it | not needed: the rule tries again | – |
 | PSM1 no longer holds it, pulling, base in the tissue | `LOST` control steps | handoff |
 
-It ends a grasp itself once the jaws have held the needle for `DWELL` control steps: then it places
-it, or goes on inserting where the tip is in the tissue already. So a grasp needs no goal: it is
-always in the middle of the range from which goals are drawn, since no image shows the goal. The
-phases of a recording go down where it goes back.
+It ends a grasp itself once the jaws have held the needle for `DWELL` control steps. Then it places
+the needle, or continues inserting if the tip is already in the tissue. A grasp therefore needs no
+goal: it is always in the middle of the range from which goals are drawn, since no image shows the
+goal. A recording's phase decreases where the expert goes back.
 
-With `late` it notices a loss so many control steps later, and does until then what it would do with
-the needle in its jaws. A high-level policy that learns from it sees what an arm looks like that has
-lost the needle and goes on (`training.visits` says from where on going back is due); a low-level
-policy should not learn from it.
+With `late` it notices a loss that many control steps later, and until then acts as if the needle
+were in its jaws. A high-level policy that learns from such a recording sees what an arm looks like
+that has lost the needle and carries on (`training.visits` says from when on going back is due). A
+low-level policy should not learn from it.
 
 It gives up (`gives_up`) where no rule leads on: PSM2 cannot reach a needle that has come to rest
 (on its face, on edge, behind the ridge), or a grasp takes `PATIENCE` steps. Everything else is
-`Expert`'s, whose labels in an undisturbed procedure differ in the grasp's goal alone.
+`Expert`'s, whose labels in an undisturbed procedure differ only in the grasp's goal.
 """
 
 import math
@@ -63,39 +63,39 @@ GRASP, PLACE, INSERT, HANDOFF, PULLOUT = range(len(names.SUBTASKS))
 LOST = 3
 """Control steps without both pads on the needle after which it is lost; contact flickers."""
 STANDING = 0.0025
-"""Jaws that stand on the phantom are nearer to their grasp than this [m], …"""
+"""Jaws count as resting on the phantom if they are closer to their grasp than this [m], …"""
 STILL = 0.0003
 """… and their distance from it has changed by less than this [m] …"""
 STALLED = 12
-"""… in so many control steps."""
+"""… in this many control steps."""
 ON_PATH = 0.002
 """A needle in the tissue that is off its path by less than this [m] …"""
 ON_PATH_ANGLE = math.radians(15.0)
-"""… and this [rad] is driven on, else drawn out."""
+"""… and this [rad] is driven further, otherwise it is drawn out."""
 FLAT = math.cos(math.radians(10.0))
 """Cosine of the lean up to which a needle counts as lying flat."""
 UPRIGHT_SHARES = (1.0, 0.5, 0.0)
 """How far a tool is turned from the needle's normal towards the vertical, tried in this order."""
 BESIDE = np.array([-5.0, 0.0, 5.0, 10.0])
-"""Other angles tried beside the middle [deg]."""
+"""Angles relative to the middle that are tried [deg]."""
 MOVED = 0.002
-"""The grasp of a needle that has moved further than this [m] …"""
+"""The grasp is chosen anew for a needle that has moved further than this [m] …"""
 MOVED_ANGLE = math.radians(8.0)
-"""… or turned further than this [rad] is chosen anew."""
+"""… or turned further than this [rad]."""
 PATIENCE = 250
-"""Control steps of a grasp after which it is given up; the expert takes 54 to 95."""
+"""Control steps after which a grasp is given up; the expert takes 54 to 95."""
 
 
 @final
 class RecoveryExpert(Demonstrator):
-    """The expert that goes back where something was lost; see the module's docstring.
+    """The expert that goes back after the needle was lost; see the module's docstring.
 
     Args:
-        env: a whole procedure.
+        env: an env of the whole procedure.
 
     Raises:
-        InputError: an env of a single subtask, which has nothing to go back to, or one that goes on
-            only where it is told.
+        InputError: an env of a single subtask, which has nothing to go back to, or one that does
+            not advance to the next subtask at a success.
     """
 
     def __init__(self, env: SuturingEnv):
@@ -112,11 +112,11 @@ class RecoveryExpert(Demonstrator):
         self._env = env
         self._expert = Expert(env)
         self._phase = -1
-        # Of the present visit: its control steps, and those since the needle was taken or let go.
+        # Of the present visit: its control steps, and those since the needle was taken or lost.
         self._steps = 0
         self._held = 0
         self._lost = 0
-        # Of its grasp: the jaws' last distances from it [m], whether they close, where it is in the
+        # Of its grasp: the jaws' last distances from it [m], whether they close, its pose in the
         # needle (T_needle_tip), and the needle's pose when it was chosen (T_world_needle).
         self._distances: deque[float] = deque(maxlen=STALLED)
         self._closes = False
@@ -125,7 +125,7 @@ class RecoveryExpert(Demonstrator):
 
     @property
     def gives_up(self) -> str:
-        """Return why no rule leads on, or ""."""
+        """Return why no rule leads any further, or ""."""
         if self._steps > PATIENCE:
             return f"no way on from {names.SUBTASKS[self._env.phase]} in {PATIENCE} steps"
         if self._env.phase == PULLOUT and self._env.simulation.task_state.holes_passed < 2:
@@ -133,7 +133,7 @@ class RecoveryExpert(Demonstrator):
         return ""
 
     def action(self) -> NDArray[np.float32]:
-        """Go back or on where that is due; return the next action, (7,) in [-1, 1]."""
+        """Go back or on if that is due; return the next action, (7,) in [-1, 1]."""
         self._watch()
         phase = self._due()
         if phase != self._env.phase:
@@ -183,7 +183,7 @@ class RecoveryExpert(Demonstrator):
         return phase
 
     def _is_on_path(self) -> bool:
-        """Return True if the needle lies so near to the stitch's path that it can be driven on."""
+        """Return True if the needle is close enough to the stitch's path to be driven further."""
         stitch = self._env.stitch
         now = poses.square(self._env.simulation.needle())
         turned = turn_about_wound(stitch.place(), now)
@@ -194,7 +194,7 @@ class RecoveryExpert(Demonstrator):
     def _grasp(self, world: WorldState) -> ToolTarget:
         """Grasp the needle in the middle of the range of goals.
 
-        Jaws that come no nearer, because they stand on the phantom, close where they are.
+        Jaws that come no closer, because they rest on the phantom, close where they are.
         """
         if self._hold is None or _has_moved(self._chosen_at, world.needle):
             self._hold = choose_grasp(world)
@@ -215,9 +215,9 @@ class RecoveryExpert(Demonstrator):
 def choose_grasp(world: WorldState) -> Matrix:
     """Return T_needle_tip (4, 4) of a grasp that leads to the stitch from where the needle lies.
 
-    That is the expert's own where the needle lies flat. A needle that leans is grasped by a tool
-    nearer to the vertical, turned about the grasped point, so that its fingers clear the phantom;
-    the first of these that can be followed all the way is taken, or else the expert's own.
+    If the needle lies flat, that is the expert's own. A needle that leans is grasped by a tool
+    closer to the vertical, turned about the grasped point, so that its fingers clear the phantom.
+    The first such grasp that can be followed all the way is taken, or else the expert's own.
     """
     stitch = world.stitch
     middle = sum(stitch.grasps(*GRASP_ANGLES)) / 2
@@ -243,15 +243,15 @@ def turned_upright(
         needle_pose: T_world_needle (4, 4).
         arm: the grasping arm.
         angle: angle of the grasped point [rad].
-        radius: of the needle's arc [m].
-        share: 0 for the tool along the needle's normal, 1 for one that points down.
+        radius: radius of the needle's arc [m].
+        share: 0 for a tool along the needle's normal, 1 for one that points down.
     """
     grasp = grasp_in_needle(arm, angle, radius=radius)
     axis = needle_pose[:3, :3] @ grasp[:3, 2]
     down = np.array([0.0, 0.0, -1.0])
     across = np.cross(axis, down)
     size = float(np.linalg.norm(across))
-    if size < 1e-9:  # it points down already, or up
+    if size < 1e-9:  # it already points down, or up
         return grasp
     lean = math.atan2(size, float(axis @ down))
     turn_in_world = rotvec_to_matrix(share * lean * across / size)
@@ -271,6 +271,6 @@ def _above(tip: Matrix) -> Matrix:
 
 
 def _has_moved(then: Matrix, now: Matrix) -> bool:
-    """Return True if the needle has moved or turned from one pose to the other, T_world_needle."""
+    """Return True if the needle's pose, T_world_needle, has moved or turned too far."""
     moved = float(np.linalg.norm(then[:3, 3] - now[:3, 3]))
     return moved > MOVED or angle_between(then, now) > MOVED_ANGLE

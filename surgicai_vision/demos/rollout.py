@@ -1,12 +1,13 @@
-"""Rollout: one episode by a demonstrator, with every state on the way.
+"""Rollout: one episode by a demonstrator, with every state along the way.
 
     result = rollout(env, expert, seed)      # one episode, kept or not
 
-With a `Disturbance` the demonstrator meets states off its own path: noise on what is executed,
-while the label stays its own answer (DART, Laskey et al. 2017), and starts that were perturbed
-before the recording begins. With a `BehaviourPolicy` these are states that a learner itself comes
-to (DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`). With upsets (`envs.upset`)
-something goes wrong once, and a demonstrator that can (`demos.recovery_expert`) goes back to it.
+With a `Disturbance` the demonstrator meets states off its own path. There is noise on what is
+executed, while the label remains its own answer (DART, Laskey et al. 2017), and starts are
+perturbed before the recording begins. With a `BehaviourPolicy` these are the states that a learner
+itself reaches (DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`). With upsets
+(`envs.upset`) something goes wrong once, and a demonstrator that can (`demos.recovery_expert`) goes
+back to correct it.
 """
 
 from dataclasses import dataclass
@@ -26,21 +27,21 @@ if TYPE_CHECKING:
     from surgicai_vision.envs.success import Info
 
 DISTURBANCE_STREAM = 0xDA27
-"""Sets the disturbance's random numbers apart from the start's, which are of the same seed."""
+"""Separates the disturbance's random numbers from the start's, which use the same seed."""
 
 
 class EpisodeRecorder:
-    """Records one episode step by step, with every state on the way.
+    """Records one episode step by step, with every state along the way.
 
     Args:
         env: the env, at its start state.
         seed: seed of the start.
-        demonstrator: who demonstrates, as it is stored.
+        demonstrator: the demonstrator's name, as it is stored.
 
     Attributes:
         info: the info of the last step.
-        observation: the observation after it.
-        truncated: whether it was the last one within the episode's limit.
+        observation: the observation after the last step.
+        truncated: whether the last step reached the episode's limit.
     """
 
     def __init__(self, env: "SuturingEnv", seed: int, demonstrator: str):
@@ -56,7 +57,7 @@ class EpisodeRecorder:
         ] = []
 
     def __len__(self) -> int:
-        """Return the control steps so far."""
+        """Return the number of control steps so far."""
         return len(self._rows)
 
     @property
@@ -74,7 +75,7 @@ class EpisodeRecorder:
 
         Args:
             action: the executed action (7,).
-            label: the demonstrator's action (7,) where it is another one.
+            label: the demonstrator's action (7,) if it differs.
         """
         phase = self._env.phase
         self.observation, reward, terminated, self.truncated, self.info = self._env.step(action)
@@ -85,14 +86,14 @@ class EpisodeRecorder:
         return bool(terminated or self.truncated)
 
     def restate(self) -> None:
-        """Take the env's present state for the last one: it was changed between two steps."""
+        """Replace the last state by the env's present one, after a change between two steps."""
         self._states[-1] = self._env.get_state()
 
     def demo(self, with_executed: bool = False, source: str = "") -> Demo:
         """Return the episode as a demonstration.
 
         Args:
-            with_executed: with the executed actions beside the labels.
+            with_executed: include the executed actions alongside the labels.
             source: sha256 of the file of the demonstration that it re-poses.
         """
         labels, actions, phases, rewards, successes, contacts = zip(*self._rows, strict=True)
@@ -139,21 +140,21 @@ def rollout(
     post_success_steps: int = 0,
     behaviour: BehaviourPolicy | None = None,
 ) -> Rollout:
-    """Run one episode of `env` from `seed` and return it with every state on the way.
+    """Run one episode of `env` from `seed` and return it with every state along the way.
 
     Args:
         env: the env; it is reset.
         demonstrator: labels every state, and acts where `behaviour` does not.
-        seed: of the start, and of all chance in the episode.
+        seed: seed of the start and of all randomness in the episode.
         name: the demonstrator's name, as it is stored.
-        disturbance: noise and perturbed starts.
-        post_success_steps: control steps recorded after the success, which show how one stops.
-        behaviour: acts in the demonstrator's place at first.
+        disturbance: noise, perturbed starts and upsets.
+        post_success_steps: control steps recorded after the success, which show how to stop.
+        behaviour: acts instead of the demonstrator at first.
     """
     rng = np.random.default_rng([seed, DISTURBANCE_STREAM])
     env.reset(seed=seed)
     if not disturbance.perturb_start(env, rng):
-        env.reset(seed=seed)  # the perturbation ended it; this start stays as it was
+        env.reset(seed=seed)  # the perturbation ended the episode; this start is left unperturbed
     deviation = disturbance.draw_deviation(rng)
     is_noisy = bool(disturbance.noise or disturbance.jaw_noise)
     demonstrator.late = disturbance.draw_late(rng)

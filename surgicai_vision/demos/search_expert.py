@@ -1,14 +1,15 @@
-"""Search expert: demonstrates grasps without knowing which point of the needle is asked for.
+"""Search expert: demonstrates grasps without knowing which point of the needle is the goal.
 
 The goal of a grasp is a point of the needle drawn from 5° to 20° of its arc (2.7 mm), which no
-image shows. Success is 1 mm: a grasp in the middle meets at most 11.3° of those 15°, and one that
-is 1 mm off fewer. `SearchExpert` grasps in the middle and, where the episode has not ended by the
-next of its `ATTEMPTS`, opens and grasps at another angle; beyond the range too, since a learner
-does not grasp exactly where it aims. The goals on a needle of another arc lie further along it
-(`Stitch.grasps`), and so do the attempts. Its labels depend on the images and on the time, so a
-policy with a clock can learn them (`benchmarks/grasp_ceiling.py` measures each way). It goes on
-after a success (`persists`), so that every demonstration shows every attempt. In every other
-subtask it is the expert.
+image shows. The tolerance is 1 mm: a grasp in the middle covers at most 11.3° of those 15°, and one
+that is 1 mm off covers less. `SearchExpert` grasps in the middle. If the episode has not ended by
+the next of its `ATTEMPTS`, it opens and grasps at another angle, also beyond the range, since a
+learner does not grasp exactly where it aims. The goals on a needle of another arc lie further along
+it (`Stitch.grasps`), and so do the attempts.
+
+Its labels depend only on the images and on the time, so a policy with a clock can learn them
+(`benchmarks/grasp_ceiling.py` measures each way). It continues after a success (`persists`), so
+that every demonstration shows every attempt. In every other subtask it is the expert.
 """
 
 import math
@@ -40,17 +41,17 @@ class SearchExpert(Demonstrator):
     """
 
     ATTEMPTS = (12.5, 6.5, 18.5, 2.5, 22.5)
-    """Angles at which a needle of 120° is grasped, one attempt after the other [deg]."""
+    """Angles at which a needle of 120° is grasped, one attempt after another [deg]."""
     SECOND_ATTEMPT_STEP = 100
-    """Control step of the second attempt, since the expert's own grasp takes 70 to 85. Another
-    follows every `CLOCK_PERIOD`, in which the clock that policies have goes round once."""
+    """Control step of the second attempt, since the expert's own grasp takes 70 to 85. Another one
+    follows every `CLOCK_PERIOD`, the period of the clock that policies get as an input."""
     OPENING_STEPS = 8
     OPEN_JAW = 0.22
     """Control steps for which the jaws open before another attempt, and how far [rad], to slide
     along the needle.
 
-    What is done depends on the step, not on what was done before: a policy without a memory could
-    not tell jaws that open from jaws that close.
+    What is done depends on the step, not on what was done before, because a policy without memory
+    could not distinguish opening jaws from closing jaws.
     """
 
     def __init__(self, env: SuturingEnv):
@@ -59,7 +60,7 @@ class SearchExpert(Demonstrator):
 
     @property
     def persists(self) -> bool:
-        """Return True in grasps, whose demonstrations go on to the episode's last step."""
+        """Return True in grasps, whose demonstrations continue to the episode's last step."""
         return self.env.task == "grasp"
 
     def action(self) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Path through the holes: how far a carried needle has turned on it, and how far it strays from it.
+"""Path through the holes: how far a carried needle has turned along it, or strays from it.
 
     turns = turns_along(stitch, needle_poses)
     strays = deviation_from_path(stitch, needle_poses) > CLEARANCE
@@ -16,9 +16,9 @@ from surgicai_vision.scene import needle
 Array = NDArray[np.float64]
 
 CLEARANCE = 0.0009
-"""Clearance of the needle on the path from the openings' edges [m]; see `envs.geometry`."""
+"""Clearance between the needle on the path and the openings' edges [m]; see `envs.geometry`."""
 OUTSIDE = 0.0003
-"""The needle enters when its tip was last further than this outside the entry [m]."""
+"""The needle enters after its tip was last further than this outside the entry [m]."""
 
 
 def turns_along(stitch: Stitch, path: Array) -> Array:

@@ -1,9 +1,9 @@
-"""Demonstrations on disk: states without images, one file an episode, each written whole.
+"""Demonstrations on disk: states without images, one file per episode, each written atomically.
 
 A folder of demonstrations holds `demos.json` (format, version, task, demonstrator, what was
 skipped) and `episode_000000.safetensors`, `episode_000001.safetensors`, … An episode file holds the
 arrays of `Demo` and, in its metadata, everything else as JSON. Nothing in it is executable; a
-damaged file is a `BadFile`.
+damaged file raises `BadFile`.
 
     write_demo(folder, 0, demo)        demo = read_demo(list_demos(folder)[0])
 """
@@ -28,7 +28,7 @@ from surgicai_vision.core.untrusted import parse_json
 FORMAT = "surgicai-vision-demos"
 VERSION = 2
 MARKER = "demos.json"
-"""The file that makes a folder a folder of demonstrations."""
+"""The file that marks a folder as a folder of demonstrations."""
 
 ARRAYS = {
     "state": ("float64", 2),
@@ -40,9 +40,9 @@ ARRAYS = {
 }
 """Array → (dtype, number of axes) as stored."""
 EXECUTED = "executed"
-"""The array that only disturbed episodes have."""
+"""Name of the array that only disturbed episodes have."""
 SOURCE = "source"
-"""What only re-posed episodes say."""
+"""Name of the metadata field that only re-posed episodes have."""
 
 
 @dataclass(frozen=True)
@@ -51,19 +51,19 @@ class Demo:
 
     Attributes:
         config: the task and scene it was made in.
-        seed: seed of the start state; -1 where the episode has none (an imported recording).
+        seed: seed of the start state; -1 if the episode has none (an imported recording).
         demonstrator: "expert", "surgicai", …
         scene_hash: hash of the compiled scene.
         code_version: version of the code that made it.
         state: whole simulator state before each step and after the last, (T + 1, n) float64.
-        action: (T, 7) float32, in [-1, 1].
+        action: the actions, which are the labels, (T, 7) float32, in [-1, 1].
         phase: index in `names.SUBTASKS` before each step, -1 in another task, (T,) int8.
-        reward: (T,) float32, of the step.
-        success: after the step, (T,) bool.
-        contact: jaws touch the needle after the step, (T,) bool.
-        executed: the executed actions where those were not `action`, the labels: (T, 7) float32,
-            or None.
-        source: sha256 of the file of the demonstration that this one re-poses; "" of its own.
+        reward: reward of each step, (T,) float32.
+        success: whether the task is met after each step, (T,) bool.
+        contact: whether the jaws touch the needle after each step, (T,) bool.
+        executed: the executed actions if they may differ from `action`, (T, 7) float32, or None.
+        source: sha256 of the file of the demonstration that this one re-poses; "" if it re-poses
+            none.
 
     Raises:
         InputError: lengths, shapes or numbers that do not match.
@@ -154,7 +154,7 @@ def demo_bytes(demo: Demo) -> bytes:
 
 
 def write_demo(folder: Path, index: int, demo: Demo) -> Path:
-    """Write episode `index` into `folder`, whole or not at all; return its path."""
+    """Write episode `index` into `folder` atomically; return its path."""
     path = folder / f"episode_{index:06d}.safetensors"
     write_bytes(path, demo_bytes(demo))
     return path
@@ -206,7 +206,7 @@ def read_marker(folder: Path) -> dict[str, Any]:
     """Read `demos.json`.
 
     Raises:
-        BadFile: `folder` is no folder of demonstrations, or another release wrote it.
+        BadFile: `folder` is not a folder of demonstrations, or another release wrote it.
     """
     if not (folder / MARKER).is_file():
         raise BadFile(
@@ -221,7 +221,7 @@ def read_marker(folder: Path) -> dict[str, Any]:
 
 
 def _check_version(path: Path, version: object) -> None:
-    """Refuse a file of another format version, those of release 0.1 (version 1) among them."""
+    """Refuse a file of another format version, including those of release 0.1 (version 1)."""
     if version != VERSION:
         writer = "was written by release 0.1" if version == 1 else f"has format version {version}"
         raise BadFile(

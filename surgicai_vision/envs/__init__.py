@@ -1,8 +1,8 @@
 """Envs: the five subtasks and the whole procedure as gymnasium environments.
 
 `make(TaskConfig(task="grasp"), obs_type="pixels")` returns an unwrapped env.
-`gymnasium.make("surgicai_vision/Grasp-v0", obs_type="pixels")` takes the same names and the fields
-of `TaskConfig`, except `max_steps`: there the limit is gymnasium's `max_episode_steps`.
+`gymnasium.make("surgicai_vision/Grasp-v0", obs_type="pixels")` takes the same arguments and the
+fields of `TaskConfig`, except `max_steps`: gymnasium's `max_episode_steps` sets the limit there.
 """
 
 import functools
@@ -32,11 +32,11 @@ OPTIONS = (
     *("step", "tolerance", "reward", "max_steps", "advance"),
     *("action_repeat", "hold_jaw", "end_on_drop"),
 )
-"""Fields of `TaskConfig` that are arguments of `make_task` as they are."""
+"""Fields of `TaskConfig` that `make_task` passes on unchanged."""
 SUBTASKS: dict[str, Subtask] = {
     subtask.name: subtask for subtask in (Grasp(), Place(), Insert(), Handoff(), Pullout())
 }
-"""Subtask name → what it is, in the order of the procedure."""
+"""Subtask name → subtask, in the order of the procedure."""
 
 
 def make(
@@ -50,9 +50,9 @@ def make(
     truncates: bool = True,
     action_mode: str = names.INCREMENTS,
 ) -> SuturingEnv:
-    """Return the unwrapped env of a task; see `observation` for what the arguments choose.
+    """Return the unwrapped env of a task; see `observation` for the observation arguments.
 
-    With `action_mode` "absolute" it is acted on by both arms' set-points (`absolute`).
+    With `action_mode` "absolute" an action is the set-points of both arms (`absolute`).
     """
     chosen = (cameras,) if isinstance(cameras, str) else tuple(cameras)
     size = _sides(image_size)
@@ -66,7 +66,7 @@ def make(
 
 
 def _sides(image_size: object) -> tuple[int, int]:
-    """Return the height and width of an image [pixel] of one side, or of both."""
+    """Return an image's height and width [pixel] from one side length or a pair of them."""
     sides = image_size if isinstance(image_size, Iterable) else (image_size, image_size)
     try:
         height, width = map(operator.index, sides)
@@ -80,7 +80,7 @@ def _sides(image_size: object) -> tuple[int, int]:
 
 @functools.cache
 def _subtask(task: str) -> Subtask:
-    """Return what a task that is one subtask is, of ours or of another distribution."""
+    """Return the subtask of a single-subtask task, built-in or of another distribution."""
     if task in SUBTASKS:
         return SUBTASKS[task]
     subtask = load_subtask(task)
@@ -126,7 +126,7 @@ def make_registered(task: str, **arguments: Any) -> SuturingEnv:
 
 
 def refuse_max_steps(arguments: Mapping[str, object]) -> None:
-    """Raise `InputError` where two arguments would limit an episode."""
+    """Raise `InputError` if `max_steps` is given: two arguments would limit an episode."""
     if "max_steps" in arguments:
         raise InputError(
             f"max_steps is {arguments['max_steps']}; of a gymnasium id the limit of an episode is "

@@ -1,20 +1,20 @@
-"""Absolute: both arms' poses and jaws as sixteen values, as the field's robot data have them.
+"""Absolute: both arms' poses and jaws as sixteen values, laid out as in the field's robot data.
 
 PSM1's position x y z [m], unit quaternion x y z w and jaw [rad], then PSM2's. `measured` is what an
-observation shows; `setpoints` is what the arms are told; in action mode "absolute" an action is the
-set-point of both arms (`follow`).
+observation shows; `setpoints` is what the arms are commanded to do; in action mode "absolute" an
+action is the set-point of both arms (`follow`).
 
-* Frame: `ECM_view`, what a surgeon sees: x left, y up, z away from the viewer. A dVRK reports
-  `measured_cp` and `setpoint_cp` in it, and those are what the datasets hold ("psm1_pose",
+* Frame: `ECM_view`, the surgeon's view: x left, y up, z away from the viewer. A dVRK reports
+  `measured_cp` and `setpoint_cp` in it, and the datasets contain these two ("psm1_pose",
   "psm1_sp"). It is the endoscope's nominal pose: randomised cameras do not move it.
-* Jaw: the angle between the fingers, as a dVRK reports it: twice one finger's, which the rest of
-  the product takes.
-* Quaternion: of its two signs the one nearer to the arm's start, so that it does not jump within an
-  episode and needs no memory. An action may have either, of any length but 0.
+* Jaw: the angle between the fingers, as a dVRK reports it: twice the angle of one finger, which the
+  rest of the product uses.
+* Quaternion: its sign is the one nearer to the arm's start, so that it does not jump within an
+  episode and depends on no history. An action may use either sign and any length except 0.
 
-The first action of an episode is free to be anywhere, and a robot is not: a set-point further from
-the present one than `LEAP` is approached by one `LEAP` a control step. One outside the workspace or
-the joints' limits is not taken; the arm then keeps its pose and takes the jaw alone.
+The first action of an episode may be anywhere, but a robot cannot jump there: a set-point further
+from the present one than `LEAP` is approached by one `LEAP` per control step. A set-point outside
+the workspace or the joint limits is rejected; the arm then keeps its pose and only the jaw follows.
 
 Sources: layout, order and jaws from `scripts/conversion/dvrk_zarr_to_lerobot.py` of
 open-h/open-h-embodiment; the frame from docs/ros_crtk_contract.md of dvrk_simulator_base ("PSM
@@ -53,19 +53,19 @@ ARM_SIZE = SIZE // len(names.ARMS)
 JAW_SCALE = 2.0
 """A dVRK's jaw angle over one finger's."""
 LEAP = StepSize(0.002, math.radians(6.0), 0.2)
-"""Furthest a set-point moves in a control step: tip [m], turn [rad], finger [rad].
+"""Largest move of a set-point per control step: tip [m], turn [rad], finger [rad].
 
-Our choice: 0.1 m/s and 300°/s, twice what PSM2 does when it lets go after the handoff, which is the
-fastest any demonstrator moves.
+Our choice: 0.1 m/s and 300°/s, twice the speed at which PSM2 lets go after the handoff, the fastest
+motion of any demonstrator.
 """
 REACH = 0.5
-"""Bound of a position's coordinates in the action space [m]; the workspace is far within it."""
+"""Bound of the position coordinates in the action space [m]; the workspace is well inside it."""
 SHORTEST = 1e-6
-"""Length of the shortest quaternion that says a direction."""
+"""Shortest length at which a quaternion still defines a rotation."""
 
 
 def _view() -> Pose:
-    """Return T_world_view of the endoscope, which stands still."""
+    """Return T_world_view of the endoscope, which does not move."""
     camera = look_at(ENDOSCOPE_DIRECTION, (0.0, 0.0, 1.0))  # x right, y down, z forward
     view = np.eye(4)
     view[:3, :3] = camera * [-1.0, -1.0, 1.0]
@@ -89,19 +89,19 @@ _HOME = {
     )
     for arm in names.ARMS
 }
-"""Arm → quaternion (w, x, y, z) of its start, which decides a quaternion's sign."""
+"""Arm → quaternion (w, x, y, z) of its start, which determines the sign of a quaternion."""
 
 
 def space() -> spaces.Box:
     """Return the space of actions in action mode "absolute"."""
     high = np.tile(np.array([REACH] * 3 + [1.0] * 4 + [JAW_SCALE * JAW_OPEN], np.float32), 2)
     low = -high
-    low[ARM_SIZE - 1 :: ARM_SIZE] = -np.float32(math.radians(20.0))  # a dVRK presses closed jaws
+    low[ARM_SIZE - 1 :: ARM_SIZE] = -np.float32(math.radians(20.0))  # a dVRK squeezes closed jaws
     return spaces.Box(low, high, dtype=np.float32)
 
 
 def measured(simulation: Simulation) -> NDArray[np.float32]:
-    """Return where both arms report their tips and jaws to be, (16,)."""
+    """Return both arms' tips and jaws as the arms report them, (16,)."""
     values: list[float] = []
     for arm in names.ARMS:
         values += _eight(arm, simulation.tip_in_base(arm), simulation.jaw(arm))
@@ -109,7 +109,7 @@ def measured(simulation: Simulation) -> NDArray[np.float32]:
 
 
 def setpoints(simulation: Simulation) -> NDArray[np.float32]:
-    """Return where both arms are told to be, (16,)."""
+    """Return both arms' commanded tips and jaws, (16,)."""
     values: list[float] = []
     for arm in names.ARMS:
         command = simulation.commands[arm]
@@ -118,7 +118,7 @@ def setpoints(simulation: Simulation) -> NDArray[np.float32]:
 
 
 def _eight(arm: str, pose: Pose, jaw: float) -> list[float]:
-    """Return an arm's eight values of a tip pose in its base and one finger's angle [rad]."""
+    """Return an arm's eight values from a tip pose in its base and one finger's angle [rad]."""
     seen = poses.compose(_T_VIEW_BASE[arm], pose)
     w, x, y, z = matrix_to_quaternion_flat(poses.rotation(seen))
     home = _HOME[arm]
@@ -127,10 +127,10 @@ def _eight(arm: str, pose: Pose, jaw: float) -> list[float]:
 
 
 def read(arm: str, values: list[float]) -> tuple[Pose, float]:
-    """Return T_base_tip and one finger's angle [rad] of an arm's eight values.
+    """Return T_base_tip and one finger's angle [rad] from an arm's eight values.
 
     Raises:
-        InputError: a quaternion without a direction.
+        InputError: a quaternion shorter than `SHORTEST`.
     """
     x, y, z, qx, qy, qz, qw, jaw = values
     length = math.hypot(qx, qy, qz, qw)
@@ -145,10 +145,10 @@ def follow(action: NDArray[np.float32], simulation: Simulation) -> dict[str, Com
 
     Args:
         action: (16,).
-        simulation: whose present commands it starts from.
+        simulation: provides the present commands, from which the action starts.
 
     Raises:
-        InputError: not sixteen finite numbers, or a quaternion without a direction.
+        InputError: not sixteen finite numbers, or a quaternion shorter than `SHORTEST`.
     """
     values = np.asarray(action).ravel().tolist()
     if len(values) != SIZE or not math.isfinite(sum(values)):
@@ -163,7 +163,7 @@ def follow(action: NDArray[np.float32], simulation: Simulation) -> dict[str, Com
 
 
 def _toward(present: Command, pose: Pose, jaw: float, base: Pose, instrument: str) -> Command:
-    """Return the command that follows `present` on the way to a pose and a finger's angle."""
+    """Return the next command after `present` on the way to a pose and a finger's angle."""
     jaw = min(max(jaw, 0.0), JAW_OPEN)
     jaw = min(max(jaw, present.jaw - LEAP.jaw), present.jaw + LEAP.jaw)
     aim = moved_towards(present.pose, pose, LEAP)

@@ -1,8 +1,8 @@
-"""Attach: the released code's rule of grasping, for comparison: grasp level "attach".
+"""Attach: the grasping rule of the released code, for comparison (grasp level "attach").
 
-While an arm's commanded jaw is closed and a pad touches the needle, a weld holds the needle where
-it is in the jaws; it goes when the jaw opens. Only scenes of this level have the welds; the default
-level, friction, has none.
+When an arm's commanded jaw is closed and a pad touches the needle, a weld holds the needle where it
+is in the jaws, until the jaw opens. Only scenes of this level have the welds; the default level,
+friction, has none.
 """
 
 import mujoco
@@ -15,7 +15,7 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
 CLOSED = 0.1
 """Commanded jaw angle [rad] below which a touched needle is attached."""
 SIZE = 7 * len(names.ARMS)
-"""Numbers of both welds' poses in the whole state."""
+"""Number of values that both welds' poses take in the whole state."""
 
 
 class Welds:
@@ -34,12 +34,12 @@ class Welds:
         return bool(self._data.eq_active[self._ids[arm]])
 
     def update(self, arm: str, *, closed: bool, touching: bool, tip: Pose, needle: Pose) -> bool:
-        """Attach or let go; return whether anything changed.
+        """Attach or release the needle; return whether anything changed.
 
         Args:
             arm: the arm.
-            closed: its jaw is told to be closed.
-            touching: a pad touches the needle.
+            closed: whether its jaw is commanded closed.
+            touching: whether a pad touches the needle.
             tip: T_world_tip.
             needle: T_world_needle.
         """

@@ -3,21 +3,21 @@
 * Description: two da Vinci PSMs, a needle and a phantom; one subtask, or all five in a row
   (`suture`).
 * Action: Box(-1, 1, (7,), float32): Δx Δy Δz Δroll Δpitch Δyaw of the active arm's tip in its own
-  base frame and Δjaw, each times the step size (`config.STEPS`); every step is 20 ms. In action
-  mode "absolute" it is both arms' set-points, (16,): see `absolute`; then no step size holds, and
-  PSM2 lets go after the handoff only where it is told to.
+  base frame and Δjaw, each scaled by the step size (`config.STEPS`); every step is 20 ms. In action
+  mode "absolute" it is both arms' set-points, (16,), see `absolute`; no step size applies then, and
+  PSM2 lets go after the handoff only when commanded to.
 * Observation: see `observation`.
 * Reward: sparse: 0 on success, else -1; dense: -(d_trans / 100 + d_angle / 10) with d_trans in cm
   and d_angle in rad; staged: 0 on success, else -(tanh(d_trans / 1 cm) + tanh(d_angle / 0.5 rad) +
-  1 where what success needs besides the pose does not hold) / 3, at most `STAGED_MOST`. The dense
-  reward pays nothing for a grasp or for the holes; the staged one does.
+  1 unless the success conditions other than the pose hold) / 3, at most `STAGED_MOST`. The dense
+  reward ignores whether the needle is grasped or has passed the holes; the staged one does not.
 * Success: judged from the measured state, never from the command: position and geodesic angle
-  within the tolerance, and what the subtask demands (jaw contact, both holes passed, needle out).
-* Start: random, seeded by `reset(seed=…)`; covers the end states of the subtask before.
+  within the tolerance, and the subtask's demands (jaw contact, both holes passed, needle out).
+* Start: random, seeded by `reset(seed=…)`; covers the end states of the previous subtask.
 * Termination: success, or a physics error (`info["physics_error"]`, never a success).
 * Truncation: `max_steps`; with `end_on_drop` also when a needle that was held at the subtask's
-  start is dropped. It truncates and does not terminate: where every step costs, an end that is
-  worth 0 would teach to drop it.
+  start is dropped. A drop truncates rather than terminates: where every step costs, a terminal
+  value of 0 would teach a policy to drop the needle.
 """
 
 import difflib
@@ -54,19 +54,19 @@ if TYPE_CHECKING:
     from surgicai_vision.envs.live.human import Human
 
 STAGE_DISTANCE = 0.01
-"""Distance [m] whose part of the staged reward is tanh 1."""
+"""Distance [m] at which its term of the staged reward is tanh 1."""
 STAGE_TURN = 0.5
-"""Angle [rad] whose part of the staged reward is tanh 1."""
+"""Angle [rad] at which its term of the staged reward is tanh 1."""
 STAGED_MOST = -0.01
 """The largest staged reward of a step without success."""
 START_DRAWS = 60
-"""Draws of a start state before giving up."""
+"""Draws of a start state before `reset` gives up."""
 RENDER_CAMERA = "front"
 RENDER_SIZE = (480, 640)
 """Height and width of what `render` returns [px]."""
 RENDER_MODES = ("human", "rgb_array")
 RESET_OPTIONS = ("randomisation",)
-"""Keys of what `reset` takes as `options`."""
+"""Keys that `reset` accepts in its `options`."""
 
 Observation = NDArray[np.float32] | Mapping[str, Frame]
 
@@ -77,13 +77,13 @@ class SuturingEnv(gymnasium.Env):
     Args:
         config: the task and its scene.
         subtasks: the subtasks of the task, in order.
-        view: what it shows.
-        render_mode: None, "rgb_array", or "human": it shows itself (`envs.live.human`).
-        truncates: end episodes at `config.max_steps`; False where gymnasium's `TimeLimit` does.
+        view: what it observes.
+        render_mode: None, "rgb_array", or "human": it displays itself (`envs.live.human`).
+        truncates: end episodes at `config.max_steps`; False if gymnasium's `TimeLimit` does.
 
     Attributes:
-        success_rule: what a success of a task of one subtask asks for beyond the paper's; learners
-            set it (`rl.settings`). `compute_reward` knows goals alone: it does not wait for a
+        success_rule: what success in a single-subtask task requires beyond the paper's; learners
+            set it (`rl.settings`). `compute_reward` sees goals alone, so it does not wait for a
             success to hold.
     """
 
@@ -141,12 +141,12 @@ class SuturingEnv(gymnasium.Env):
         """Draw a start state; `seed` makes it reproducible.
 
         Args:
-            seed: of all that is drawn.
-            options: `randomisation`: axis → numbers in place of those that are drawn, as
+            seed: seed of everything that is drawn.
+            options: `randomisation`: axis → numbers to use instead of the drawn ones, as
                 `info["randomisation"]` reports them; the env must have some randomisation.
 
         Raises:
-            UnknownName: `randomisation` misspelt, or no such axis; other keys are for others.
+            UnknownName: `randomisation` misspelt, or no such axis; other keys are ignored.
             InputError: numbers that no episode can have, or an env without randomisation.
             PhysicsError: no start was physical.
         """
@@ -157,8 +157,8 @@ class SuturingEnv(gymnasium.Env):
         simulation = self.simulation
         first = self._subtasks[0]
         if axes.on:
-            # Numbers of their own: a start is the same whatever is randomised, so that evaluations
-            # can be paired.
+            # A generator of its own keeps a start the same whatever is randomised, so that
+            # evaluations can be paired.
             draws = randomisation.draw(axes, self.np_random.spawn(1)[0])
             simulation.randomise(randomisation.with_numbers(draws, given))
             self._meet_draws()
@@ -184,7 +184,7 @@ class SuturingEnv(gymnasium.Env):
         return self.observe(), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
-        """Take one control step of 20 ms, or `action_repeat` of them until the episode ends."""
+        """Take one 20 ms control step, or up to `action_repeat` of them until the episode ends."""
         if self.config.hold_jaw and self.subtask.starts_held:
             action = np.array([*np.asarray(action).ravel()[:6], 0.0], np.float32)
         for _ in range(self.config.action_repeat - 1):
@@ -247,14 +247,14 @@ class SuturingEnv(gymnasium.Env):
     def render(self) -> NDArray[np.uint8] | None:
         """Return the front camera's image, (480, 640, 3) uint8, in render mode "rgb_array".
 
-        In render mode "human" every reset and step has shown itself already.
+        In render mode "human" every reset and step has already been displayed.
         """
         if self.render_mode != "rgb_array":
             return None
         return self.image(RENDER_CAMERA, RENDER_SIZE).astype(np.uint8, copy=False)
 
     def _shown(self) -> "Human":
-        """Return what shows this env to a person, opened on first use."""
+        """Return the display of this env, opened on first use."""
         if self._human is None:
             from surgicai_vision.envs.live.human import Human  # no other env needs a server
 
@@ -277,18 +277,18 @@ class SuturingEnv(gymnasium.Env):
             quality: "fast", as observations are, or "high".
 
         Returns:
-            (height, width, channels) as `scene.rendering.FrameRenderer.render` has it.
+            (height, width, channels) as from `scene.rendering.FrameRenderer.render`.
         """
         return self._images.frames(view, size, (modality,), quality)[modality]
 
     def close(self) -> None:
-        """Free the renderer, and end what a person sees."""
+        """Free the renderer and close the display."""
         self._images.close()
         if self._human is not None:
             self._human.close()
             self._human = None
 
-    # -- what it is --------------------------------------------------------------------------------
+    # -- properties --------------------------------------------------------------------------------
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -302,7 +302,7 @@ class SuturingEnv(gymnasium.Env):
 
     @property
     def frame_skip(self) -> int:
-        """Return the physics steps in a control step."""
+        """Return the number of physics steps per control step."""
         return SUBSTEPS
 
     @property
@@ -334,14 +334,14 @@ class SuturingEnv(gymnasium.Env):
 
     @property
     def phase(self) -> int:
-        """Return the present subtask's index in `names.SUBTASKS`, -1 for a task of its own."""
+        """Return the present subtask's index in `names.SUBTASKS`, -1 for a task not among them."""
         return self.simulation.task_state.phase
 
     def enter(self, phase: int) -> None:
-        """Make a subtask the present one; a task of one subtask has only its own.
+        """Make a subtask the present one; a single-subtask task accepts only its own.
 
         Args:
-            phase: index in `names.SUBTASKS`; that of the present subtask changes nothing.
+            phase: index in `names.SUBTASKS`; the present subtask's index changes nothing.
         """
         if phase != self.phase:
             raise InputError(
@@ -349,7 +349,7 @@ class SuturingEnv(gymnasium.Env):
             )
 
     def named(self, kind: str, name: str) -> int:
-        """Return an element's id; a wrong name lists what exists."""
+        """Return an element's id; the error for a wrong name lists the valid ones."""
         return self.scene.named(kind, name)
 
     # -- state -------------------------------------------------------------------------------------
@@ -360,7 +360,7 @@ class SuturingEnv(gymnasium.Env):
 
     @property
     def snapshot(self) -> tuple[NDArray[np.float64], dict[str, object]]:
-        """The whole state and that of the generator that draws the next starts; may be set."""
+        """The whole state and that of the generator that draws the next starts; settable."""
         return self.get_state(), dict(self.np_random.bit_generator.state)
 
     @snapshot.setter
@@ -370,7 +370,7 @@ class SuturingEnv(gymnasium.Env):
         self.np_random.bit_generator.state = generator
 
     def set_state_vector(self, state: NDArray[np.float64]) -> None:
-        """Restore a state of `get_state`: what follows is what followed then."""
+        """Restore a state from `get_state`: the episode continues from it exactly as it did."""
         before = self.simulation.draws
         self._moves += 1
         self.simulation.set_state(state)
@@ -378,7 +378,7 @@ class SuturingEnv(gymnasium.Env):
             self._meet_draws()
 
     def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
-        """Set positions and velocities, as gymnasium's MujocoEnv does; commands stay."""
+        """Set positions and velocities, as gymnasium's MujocoEnv does; commands are kept."""
         if np.shape(qpos) != (self.model.nq,) or np.shape(qvel) != (self.model.nv,):
             raise InputError(
                 f"set_state got shapes {np.shape(qpos)} and {np.shape(qvel)}; "
@@ -401,7 +401,7 @@ class SuturingEnv(gymnasium.Env):
         return self.subtask.target(self.simulation, self.stitch)
 
     def tolerance(self) -> Tolerance:
-        """Return how near the present subtask's goal is near enough, by the rule of success."""
+        """Return the tolerance about the present subtask's goal under the success rule."""
         share = self.success_rule.tolerance_share
         return self.subtask.tolerances[self.config.tolerance].scaled(share)
 
@@ -441,10 +441,10 @@ class SuturingEnv(gymnasium.Env):
         return np.array(sevens, dtype=np.float32).ravel()
 
     def setpoint(self) -> NDArray[np.float32]:
-        """Return how far the active arm's set point lies from its measured tip, (7,) [m, rad].
+        """Return the offset of the active arm's set point from its measured tip, (7,) [m, rad].
 
-        x y z and the rotation vector of the turn in the arm's base, and the jaw. Tissue and load
-        hold the tool back, and it lags; a dVRK tells both poses (`setpoint_cp`, `measured_cp`).
+        x y z and the rotation vector in the arm's base, and the jaw. The tool lags because tissue
+        and load hold it back; a dVRK reports both poses (`setpoint_cp`, `measured_cp`).
         """
         simulation = self.simulation
         arm = self.subtask.arm
@@ -454,9 +454,9 @@ class SuturingEnv(gymnasium.Env):
         )
 
     def absolute_pos(self) -> NDArray[np.float32]:
-        """Return both arms' measured poses and jaws as the field's data have them, (16,).
+        """Return both arms' measured poses and jaws, laid out as in the field's data, (16,).
 
-        See `absolute`; it is `agent_pos` of an observation in action mode "absolute".
+        See `absolute`; this is `agent_pos` of an observation in action mode "absolute".
         """
         return absolute.measured(self.simulation)
 
@@ -489,14 +489,14 @@ class SuturingEnv(gymnasium.Env):
         return self._images.look(self.view) | beside
 
     def defer_images(self) -> None:
-        """Render each image of an observation when it is first looked at (`core.lazy`).
+        """Render each image of an observation only when it is first accessed (`core.lazy`).
 
-        For who looks at few of many views; an observation is then no plain dict.
+        For callers that use few of many views; an observation is then not a plain dict.
         """
         self._defers = True
 
     def _makers(self) -> dict[str, Callable[[], Frame]]:
-        """Return what makes each frame of an observation of the present state."""
+        """Return functions that render the frames of an observation of the present state."""
         moves = self._moves
 
         def frame(view: str, modality: str) -> Frame:
@@ -525,7 +525,7 @@ class SuturingEnv(gymnasium.Env):
         return observation.state_vector_in_world(arm, simulation.bases[arm], tip, *target, jaw)
 
     def _relative_state(self, target: Target) -> NDArray[np.float32]:
-        """Return the relative features; in a whole procedure those of the present subtask."""
+        """Return the relative features; in the whole procedure, those of the present subtask."""
         simulation = self.simulation
         subtask = self.subtask
         achieved, desired = target
@@ -547,7 +547,7 @@ class SuturingEnv(gymnasium.Env):
         return [-1.0 if value < -1.0 else 1.0 if value > 1.0 else value for value in values]
 
     def _meet_draws(self) -> None:
-        """Follow new draws: goals move with the phantom, the renderer redraws the needle."""
+        """Adapt to new draws: goals move with the phantom, the renderer redraws the needle."""
         simulation = self.simulation
         axes = self.config.randomisation
         self.stitch = Stitch.of(simulation.pair, simulation.radius, simulation.tip_angle)
@@ -555,7 +555,7 @@ class SuturingEnv(gymnasium.Env):
             self._images.close()
 
     def _remember_tool(self) -> None:
-        """Measure the path of the active tip from its present place on."""
+        """Start measuring the active tip's path at its present position."""
         tip = self.simulation.tip(self.subtask.arm)
         self.simulation.task_state.tool_tip = poses.position(tip)
 
@@ -567,21 +567,21 @@ class SuturingEnv(gymnasium.Env):
         state.tip_path += ((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2) ** 0.5
 
     def _meets_demands(self) -> bool:
-        """Return True if what the episode's success needs besides the pose holds now."""
+        """Return True if the conditions of the episode's success other than the pose hold now."""
         return self._meets_subtask()
 
     def _meets_subtask(self) -> bool:
-        """Return True if what the present subtask's success needs besides the pose holds now."""
+        """Return True if the conditions of the subtask's success other than the pose hold now."""
         is_met = meets_demands(self.simulation, self.subtask, self.stitch, self.config.tolerance)
         return is_met and self._has_kept_holes()
 
     def _has_kept_holes(self) -> bool:
-        """Return True unless a hole passed at the start was lost, and that counts."""
+        """Return False if a hole passed at the start was lost and the success rule forbids that."""
         passed = self.simulation.task_state.holes_passed
         return not self.success_rule.keeps_holes or passed >= self.subtask.passed_at_start
 
     def _progress(self, info: Info) -> bool:
-        """Go on to the next subtask, where a task has several; return True if so."""
+        """Advance to the next subtask if the task has several; return True if it did."""
         if info["is_success"]:
             info["is_success"] = self._is_within_share(info) and self._has_kept_holes()
         if self.success_rule.steps > 1:
@@ -589,13 +589,13 @@ class SuturingEnv(gymnasium.Env):
         return False
 
     def _is_within_share(self, info: Info) -> bool:
-        """Return True if the pose is within the share of the tolerance that counts."""
+        """Return True if the pose is within the success rule's share of the tolerance."""
         tolerance = self.tolerance()
         near: bool = info["d_trans"] <= tolerance.distance and info["d_angle"] <= tolerance.angle
         return near
 
     def _count_dwell(self, holds: bool) -> int:
-        """Return the control steps for which something has held, this one with them."""
+        """Return for how many control steps something has held, including this one."""
         state = self.simulation.task_state
         state.dwell = state.dwell + 1 if holds else 0
         return state.dwell
@@ -604,12 +604,12 @@ class SuturingEnv(gymnasium.Env):
 def _given(
     options: Mapping[str, object], axes: RandomisationConfig
 ) -> Mapping[str, Sequence[float]]:
-    """Return axis → numbers of the options of a reset, or refuse the options.
+    """Return axis → numbers from the options of a reset, or refuse the options.
 
-    The axes and their numbers are looked at where they are put in (`randomisation.with_numbers`).
+    The axes and their numbers are checked where they are inserted (`randomisation.with_numbers`).
     """
     for key in options:
-        # Programs that drive envs add keys of their own, as LeRobot does; ours misspelt is refused.
+        # Programs that drive envs, such as LeRobot, add their own keys; ours misspelt is refused.
         if difflib.get_close_matches(str(key), RESET_OPTIONS, n=1):
             check_name("option of reset", key, RESET_OPTIONS)
     given = options.get("randomisation") or {}
@@ -622,12 +622,12 @@ def _given(
             "options['randomisation'] gives numbers, and this env has no randomisation; make it "
             f"with one, such as randomisation={{'{next(iter(given))}': …}}."
         )
-    # The latency is reported as well, and is the env's own.
+    # The latency is reported as well, but is fixed by the env.
     return {axis: of for axis, of in given.items() if axis != "latency" or of != axes.latency}
 
 
 def _refuse_increments(config: TaskConfig) -> None:
-    """Raise `InputError` for options that change increments, where actions are set-points."""
+    """Raise `InputError` for options that change increments: actions are set-points here."""
     if config.hold_jaw or config.randomisation.latency:
         given = "hold_jaw" if config.hold_jaw else "latency"
         raise InputError(
@@ -644,7 +644,7 @@ def staged_reward(
     Args:
         distance: to the goal [m], a number or (batch,).
         turn: to the goal [rad].
-        is_met: whether what success needs besides the pose holds.
+        is_met: whether the success conditions other than the pose hold.
         is_success: whether the task is solved.
     """
     away = np.tanh(np.divide(distance, STAGE_DISTANCE))

@@ -1,4 +1,4 @@
-"""Bite: one passage of the needle through soft tissue, as others read it and as it is kept."""
+"""Bite: one passage of the needle through soft tissue, as others read it and as it is stored."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,27 +8,27 @@ from surgicai_vision.scene.holes import Point
 from surgicai_vision.scene.tissue import HIDDEN
 
 NO_FLANK = -1
-"""The exit's flank of a bite that has none."""
+"""The exit flank of a bite without an exit."""
 SIDES = ("entry", "exit")
-"""The two flanks of the ridge, by the holes that the layouts have there."""
+"""The two flanks of the ridge, named after the holes that the layouts have there."""
 
 
 @dataclass(frozen=True)
 class Bite:
-    """One passage of the needle through the tissue, in world, at the present place of the phantom.
+    """One passage of the needle through the tissue, in world, for the phantom's present placement.
 
     Attributes:
-        entry: where it went in, on the undeformed skin [m].
-        exit: where it came out [m]; None before, and of a needle that was drawn back.
+        entry: where the needle went in, on the undeformed skin [m].
+        exit: where it came out [m]; None before that, and if the needle was drawn back.
         entry_side: the flank it went in through, "entry" or "exit".
-        exit_side: the flank it came out through; "" before.
+        exit_side: the flank it came out through; "" before that.
         entry_piece: piece of the ridge at the entry, 1 to 4: that of the hole pair there.
-        exit_piece: the same of the exit; 0 before.
-        depth: deepest place of the tip under the nearer flank so far [m].
+        exit_piece: the same for the exit; 0 before that.
+        depth: largest depth of the tip below the nearer flank so far [m].
         length: length of the needle's arc in the tissue when the tip was furthest [m].
-        tears: how often the tissue tore in it.
-        is_done: the needle has left it.
-        path: points of the tip's way through the tissue [m]; of the present passage alone.
+        tears: how often the tissue tore during this bite.
+        is_done: the needle has left the tissue.
+        path: points of the tip's path through the tissue [m]; for the present passage only.
     """
 
     entry: Point
@@ -46,10 +46,10 @@ class Bite:
 
 @dataclass
 class Passage:
-    """A bite as `Tissue` keeps it: in the phantom's frame, flanks by their index in `Ridge`.
+    """A bite as `Tissue` stores it: in the phantom's frame, flanks by their index in `Ridge`.
 
-    `entry_now` and `exit_now` are where the pierced places lie since the tissue gave way; the
-    others are as in `Bite`.
+    `entry_now` and `exit_now` are where the pierced points lie after the tissue gave way; the other
+    fields are as in `Bite`.
     """
 
     entry: Point
@@ -64,7 +64,7 @@ class Passage:
     exit_now: Point = HIDDEN
 
     SIZE: ClassVar[int] = 18
-    """Numbers of a packed passage."""
+    """Number of values in a packed passage."""
 
     @property
     def is_out(self) -> bool:
@@ -88,7 +88,7 @@ class Passage:
 
     @classmethod
     def unpack(cls, values: Sequence[float]) -> "Passage":
-        """Return the passage of `SIZE` numbers."""
+        """Return the passage packed as `SIZE` numbers."""
         return cls(
             entry=(values[0], values[1], values[2]),
             entry_flank=int(values[3]),

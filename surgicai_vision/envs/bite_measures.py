@@ -1,25 +1,25 @@
 """Bite measures: where a stitch went in and out of the tissue, how deep, and at which angles.
 
-A *bite* is one passage of the needle through the tissue. Two watches follow its tip, one step after
-another, and give the same measures of the latest bite of an episode:
+A *bite* is one passage of the needle through the tissue. Two watches follow the needle's tip step
+by step and give the same measures of the latest bite of an episode:
 
-* `ChannelWatch`, tissue "channels": a bite begins where the tip goes through the opening of the
-  entry, inwards, and ends where it goes through that of the exit, outwards. The openings are
-  squares of `holes.OPENING`, so an error is at most their half diagonal, 2.7 mm.
-* `SoftWatch`, tissue "soft": a bite is what the tissue says (`envs.tissue`): it can begin and end
-  anywhere.
+* `ChannelWatch`, tissue "channels": a bite begins where the tip passes inwards through the entry's
+  opening and ends where it passes outwards through the exit's. The openings are squares with sides
+  of `holes.OPENING`, so an error is at most half their diagonal, 2.7 mm.
+* `SoftWatch`, tissue "soft": the tissue itself reports the bites (`envs.tissue`); they can begin
+  and end anywhere.
 
-The measures, each NaN where its part of the bite was not made in this episode (a start inside the
-tissue brings its own bite):
+The measures, each NaN if its part of the bite was not made in this episode (a start inside the
+tissue comes with its own bite):
 
 * `entry_error`, `exit_error`: from the bite's point to the mark (the hole's centre) [m].
-* `length`: straight from entry to exit [m].
-* `depth`: of the deepest point of the tip's path under that straight line, along world -z [m].
-* `entry_angle`, `exit_angle`: of the needle's tangent at its tip to the skin's normal at the mark,
-  when the tip goes in and out [rad]; 0 is square to the skin, as surgical textbooks ask.
-* `wrong_hole`: channels: the tip went through an opening of another stitch, or through this exit
-  from outside, and has not left through the right exit since. Soft: the latest bite begins or ends
-  nearer to another mark than to its own.
+* `length`: straight-line distance from entry to exit [m].
+* `depth`: of the deepest point of the tip's path below that straight line, along world -z [m].
+* `entry_angle`, `exit_angle`: between the needle's tangent at its tip and the skin's normal at the
+  mark, when the tip goes in or out [rad]; 0 is perpendicular, as surgical textbooks recommend.
+* `wrong_hole`: in channels, the tip went through an opening of another stitch, or through this exit
+  from outside, and has not left through the right exit since. In soft tissue, the latest bite
+  begins or ends nearer to another mark than to its own.
 """
 
 import math
@@ -52,14 +52,14 @@ class BiteWatch(Protocol):
     """Follows the needle's tip."""
 
     measures: BiteMeasures
-    """Of the latest bite."""
+    """Measures of the latest bite."""
 
     def update(self) -> None:
         """Read the state that a control step ended in."""
 
 
 def watch_of(simulation: Simulation, pair: HolePair, others: Sequence[HolePair]) -> BiteWatch:
-    """Return what follows the tip of a simulation from its present state on.
+    """Return a watch that follows the tip of a simulation from its present state on.
 
     Args:
         simulation: the simulation.
@@ -72,9 +72,9 @@ def watch_of(simulation: Simulation, pair: HolePair, others: Sequence[HolePair])
 
 
 def depth_under(entry: Point, leave: Point, path: Sequence[Point]) -> float:
-    """Return how deep a path goes under the straight line from `entry` to `leave` [m].
+    """Return how deep a path goes below the straight line from `entry` to `leave` [m].
 
-    Along world -z, over the points of the path that lie between the two in the line's direction; at
+    Measured along world -z over the points of the path that lie between the two along the line; at
     least 0.
     """
     way = [after - before for before, after in zip(entry, leave, strict=True)]
@@ -146,7 +146,7 @@ class ChannelWatch:
             self._path.append(now)
 
     def _note_crossings(self, before: Point, now: Point) -> None:
-        """Note where the tip went through the opening of any hole."""
+        """Record where the tip went through the opening of any hole."""
         pair = self._pair
         entering = crossing(before, now, pair.entry, inward=True)
         leaving = crossing(before, now, pair.exit, inward=False)
@@ -166,7 +166,7 @@ class ChannelWatch:
             self.measures = replace(self.measures, wrong_hole=True)
 
     def _enter(self, place: tuple[float, float]) -> None:
-        """Begin a bite; what was noted of one before stays but for its entry."""
+        """Begin a bite; of the previous bite's measures only those of the entry are replaced."""
         hole = self._pair.entry
         self._is_inside = True
         self._entry = _in_world(hole, place)
@@ -193,7 +193,7 @@ class ChannelWatch:
 
 
 class SoftWatch:
-    """Follows the bites that soft tissue notes.
+    """Follows the bites that soft tissue records.
 
     Args:
         simulation: read from its present state on.
@@ -251,7 +251,7 @@ class SoftWatch:
         )
 
     def _leave(self, bite: Bite, leave: Point) -> None:
-        """Note where the tip came out."""
+        """Record where the tip came out."""
         mark = self._nearest(leave)
         own = self._is_own
         self.measures = replace(

@@ -1,12 +1,12 @@
-"""Calibration: what an env's robot knows of its cameras, and where its crops lie.
+"""Calibration: what an env's robot knows about its cameras, and where its crops lie.
 
 * `intrinsics(view, size)`: K (3, 3) [pixel] of a view's image;
 * `extrinsics(view)`: T_world_camera (4, 4) [m];
 * `window(view, size)`: where a crop lies in its camera's whole image, None for a camera.
 
-All of it is nominal: the cameras stand and see as in the scene without randomisation, and an arm
-is where its joints report it, kinematic error included. A camera that was moved is not followed:
-it takes the image, and the window stays where the nominal calibration puts it.
+All of it is nominal: camera poses and fields of view are those of the scene without randomisation,
+and an arm is where its joints report it to be, kinematic error included. A randomised camera is not
+followed: it takes the image, but the window stays where the nominal calibration puts it.
 """
 
 import functools
@@ -58,7 +58,7 @@ class Calibration:
         return window_about(crop, in_camera, self._fovy(crop.camera), *size)
 
     def reported_grasp(self, arm: str) -> Pose:
-        """Return T_world_grasp of an arm as its reported joints and its nominal base tell it."""
+        """Return T_world_grasp of an arm from its reported joints and its nominal base."""
         simulation = self._simulation
         tip = poses.compose(simulation.bases[arm], simulation.tip_in_base(arm))
         return poses.shifted_along_z(tip, GRASP_DEPTH)
@@ -68,7 +68,7 @@ class Calibration:
         return math.radians(float(self._model.cam_fovy[cameras.camera_id(self._model, camera)]))
 
     def _pose(self, camera: str) -> Pose:
-        """Return a camera's pose in world, of one that stands still without computing it anew."""
+        """Return a camera's pose in world; that of a stationary camera is computed only once."""
         if camera in self._standing:
             return self._standing[camera]
         pose = poses.flat(cameras.extrinsics(self._model, self._put_nominal(), camera))
@@ -82,7 +82,7 @@ class Calibration:
         return mujoco.MjData(self._model)
 
     def _put_nominal(self) -> mujoco.MjData:
-        """Return the nominal scene with its bodies where the reported joints say."""
+        """Return the nominal scene with its bodies where the reported joints put them."""
         simulation = self._simulation
         nominal = self._nominal
         nominal.qpos[:] = simulation.data.qpos

@@ -35,7 +35,7 @@ PALETTE = np.array(
 BEYOND = 1.0
 """Depth [m] from which a pixel is background; the scene is 0.2 m deep."""
 LETTERS = 7.0
-"""Letters of a sheet's title for each inch of its width."""
+"""Letters of a sheet's title that fit into each inch of its width."""
 
 
 class Draw(Protocol):
@@ -47,7 +47,7 @@ class Draw(Protocol):
 
 @contextmanager
 def state_renderer(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Draw]:
-    """Yield what draws states of a task's env."""
+    """Yield a function that draws states of a task's env."""
     env = make(config, obs_type="state")
     env.reset(seed=0)
 
@@ -64,7 +64,7 @@ def state_renderer(config: TaskConfig, size: int, quality: str = "high") -> Iter
 def start_images(
     config: TaskConfig, views: Sequence[str], seeds: Sequence[int], size: int, quality: str
 ) -> list[Image]:
-    """Return the starts of episodes, (size, size, 3) each: seed after seed in all the views."""
+    """Return images of episode starts, (size, size, 3) each: every view of each seed in turn."""
     env = make(config, obs_type="state")
     images = []
     for seed in seeds:
@@ -96,9 +96,9 @@ def coloured(frame: Frame, modality: str) -> Image:
 
 
 def depth_range(frame: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the depths [m] between which colours are spread.
+    """Return the range of depths [m] that the colour map covers.
 
-    They are the 2nd and the 90th percentile of the depths before `BEYOND`.
+    It goes from the 2nd to the 90th percentile of the depths nearer than `BEYOND`.
     """
     inside = frame[frame < BEYOND]
     if not inside.size:
@@ -112,7 +112,7 @@ def sheet(
 ) -> "Figure":
     """Return a matplotlib figure: a grid of images with a name for each row and column.
 
-    A title that is wider than the grid goes on in further lines.
+    A title that is wider than the grid is wrapped.
     """
     from matplotlib.figure import Figure
 
@@ -136,7 +136,7 @@ def sheet(
 
 
 def write(figure: "Figure", path: Path, dpi: int) -> None:
-    """Write a sheet whole: a kill leaves what was there; the suffix names the format."""
+    """Write a sheet atomically: a kill leaves the old file; the suffix selects the format."""
     with files.whole_file(path) as temporary:
         figure.savefig(temporary, dpi=dpi)
 

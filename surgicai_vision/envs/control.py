@@ -1,13 +1,13 @@
-"""Control: an action of the env becomes joint commands of one arm.
+"""Control: turn an action of the env into joint commands of one arm.
 
 The command is a pose of the tool tip in the arm's own base frame plus the jaw angle. An action in
 [-1, 1]⁷ moves it by at most one step size: translation along the base's axes, rotation by a
 rotation vector in the base's axes (for steps of 2° this equals the released code's roll-pitch-yaw
-increments to first order, and it has no singularity), and the jaw. A command that leaves the
-workspace or a joint limit is not taken: the command stays.
+increments to first order, and it has no singularity), and the jaw. A pose outside the workspace or
+the joint limits is rejected: the arm keeps its commanded pose, and only the jaw changes.
 
-Plain floats throughout: a pose is the tuple of twelve floats of `scene.kinematics`; numpy on 3 × 3
-arrays would cost more than the physics saves.
+It uses plain floats throughout: a pose is the tuple of twelve floats of `scene.kinematics`; numpy
+on 3 × 3 arrays would cost more than the physics saves.
 """
 
 import math
@@ -27,25 +27,25 @@ from surgicai_vision.scene.rotations import (
 JAW_OPEN = 1.0
 """Largest commanded jaw angle [rad]; 0 is closed."""
 SQUEEZE = 0.3
-"""How far the jaw's servo is led past a closed jaw's command [rad].
+"""How far the jaw servo's set point goes beyond the command of a closed jaw [rad].
 
-The motor's torque limit then sets the force of the grip.
+The motor's torque limit then sets the grip force.
 """
 SQUEEZE_BELOW = 0.1
-"""Commands below which that begins [rad], gently, so that the pads do not slam."""
+"""Commands below which this sets in [rad], gradually, so that the pads do not slam."""
 WORKSPACE = ((-0.09, -0.09, 0.060), (0.09, 0.14, 0.165))
 """Corners of the box the tips may move in [m, world]."""
 COMMAND_SIZE = 12 + 1 + 6
-"""Numbers of a packed command."""
+"""Number of values in a packed command."""
 
 
 class Command(NamedTuple):
-    """What an arm is told to do.
+    """What an arm is commanded to do.
 
     Attributes:
         pose: tip pose in the arm's base.
         jaw: jaw angle [rad].
-        joints: what puts the tip there.
+        joints: the joints that put the tip there.
     """
 
     pose: Pose
@@ -89,9 +89,9 @@ def moved(pose: Pose, action: list[float], step: StepSize) -> Pose:
 
 
 def moved_towards(start: Pose, goal: Pose, step: StepSize) -> Pose:
-    """Return `goal`, or where one step from `start` on the straight way towards it ends.
+    """Return `goal` if one step from `start` reaches it, else the end of one step towards it.
 
-    Translation and rotation take the same share of their ways, so that both arrive together.
+    Translation and rotation cover the same share of their distances, so that both arrive together.
     """
     far = poses.distance(start, goal) / step.translation
     turn = matrix_to_rotvec_flat(
@@ -111,7 +111,7 @@ def moved_towards(start: Pose, goal: Pose, step: StepSize) -> Pose:
 def follow(
     command: Command, action: list[float], step: StepSize, base: Pose, instrument: str
 ) -> Command:
-    """Return the command after `action`; the pose stays where the new one cannot be reached.
+    """Return the command after `action`; the pose stays if the new one cannot be reached.
 
     Args:
         command: the present command.

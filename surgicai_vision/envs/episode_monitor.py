@@ -4,17 +4,17 @@ An `EpisodeMonitor` only reads: an episode is the same with and without it.
 
 * `bite`: where the needle's tip went in and out, how deep and at which angles
   (`envs.bite_measures`).
-* `slip`, `turn`: the needle's largest shift [m] and turn [rad] in the active jaws since they took
-  it.
+* `slip`, `turn`: the needle's largest shift [m] and turn [rad] in the active jaws since they
+  grasped it.
 * `force`: net force on the tissue when the last control step ended [N]; 0 at the start.
 * `tissue_force`: largest net force [N] of needle and instruments (not of the thread) on the
-  phantom, as a force plate under it would show. Sampled when a control step ends, at 50 Hz: a
-  shorter blow can be missed. `tissue_impulse` is its sum over time [N s].
-* `tears`: how often the tissue tore; NaN in channels, where nothing can.
-* `thread_drawn`: the most thread that was drawn out of the exit behind the needle [m]; 0 before the
+  phantom, as a force plate under it would show. It is sampled when a control step ends, at 50 Hz,
+  so a shorter impact can be missed. `tissue_impulse` is the net force summed over time [N s].
+* `tears`: how often the tissue tore; NaN in channels, which cannot tear.
+* `thread_drawn`: largest length of thread drawn out of the exit behind the needle [m]; 0 before the
   needle is out, NaN without a thread.
-* `paper_success`: the paper's own success was reached (`envs.success`), whatever soft tissue asks
-  besides.
+* `paper_success`: the paper's own success was reached (`envs.success`), whatever else soft tissue
+  requires.
 """
 
 import itertools
@@ -38,7 +38,7 @@ class EpisodeMonitor:
     """What the present episode of `env` has done; see the module's docstring.
 
     Args:
-        env: the env to read; `reset` follows each of its resets, `update` each of its steps.
+        env: the env to read; call `reset` after each of its resets, `update` after each step.
     """
 
     def __init__(self, env: SuturingEnv):
@@ -112,8 +112,8 @@ def drawn_length(points: Sequence[Point], leave: Hole) -> float:
     """Return the length of a thread from its first point to where it goes through a plane [m].
 
     Args:
-        points: of the thread from the needle on [m].
-        leave: the exit, whose plane parts what is out from what is not.
+        points: points of the thread, from the needle on [m].
+        leave: the exit, whose plane separates what is out from what is not.
     """
     length = 0.0
     for before, after in itertools.pairwise(points):
@@ -129,7 +129,7 @@ def drawn_length(points: Sequence[Point], leave: Hole) -> float:
 
 
 def _thread_bodies(model: mujoco.MjModel) -> list[int]:
-    """Return the bodies of the thread's segments, from the needle on; none without a thread."""
+    """Return the bodies of the thread's segments, from the needle on; empty without a thread."""
     names_of_bodies = (model.body(index).name for index in range(model.nbody))
     found = [name for name in names_of_bodies if re.fullmatch(r"thread_\d+", name)]
     return [model.body(f"thread_{index}").id for index in range(len(found))]

@@ -1,15 +1,15 @@
-"""Feasibility: what geometry forbids is refused before an env is made, with the reason.
+"""Feasibility: refuse what geometry forbids before an env is made, and say why.
 
-`refuse_impossible(config, through)` looks at the corners of what a task's randomisation may draw:
+`refuse_impossible(config, through)` checks the extremes of what a task's randomisation may draw:
 
 * Room for PSM2's jaws at the end of the insertion, and for the needle's tip when its base comes out
-  (`geometry`): every pair that may be sewn, with the smallest needle of every arc.
-* Reach: the joints of both arms along the needle's whole way, with nominal grasps, for the corners
-  of the phantom's places. (A start whose own, imperfect grasp is out of reach is drawn again.)
-* View: with the phantom's place varied, both holes stay in the images of `VIEWS`.
+  (`geometry`): for every pair that may be sewn, with the smallest needle of every arc.
+* Reach: the joints of both arms along the needle's whole path, with nominal grasps, for the extreme
+  placements of the phantom. (A start whose own, imperfect grasp is out of reach is drawn again.)
+* View: if the phantom's placement varies, both holes stay in the images of `VIEWS`.
 
-Within the limits of `core.config` the layout `simple` with instrument 400006 passes the last two
-for every draw: the limits were chosen so (`tests/envs/test_feasibility.py`).
+Within the limits of `core.config`, layout `simple` with instrument 400006 passes the last two
+checks for every draw: the limits were chosen for this (`tests/envs/test_feasibility.py`).
 """
 
 import functools
@@ -44,14 +44,14 @@ VIEWS = ("front", "endo_left", "endo_right")
 
 
 def refuse_impossible(config: TaskConfig, through: bool) -> None:
-    """Refuse a task that geometry forbids for something that may be drawn.
+    """Refuse a task if geometry forbids something that may be drawn for it.
 
     Args:
         config: the task.
-        through: True if the needle is driven through the tissue; else only view and reach matter.
+        through: True if the needle is driven through the tissue; else only the view is checked.
 
     Raises:
-        InputError: naming what is in the way, and the largest value that is allowed.
+        InputError: naming the obstacle and what is allowed instead.
     """
     if through:
         _refuse_narrow(config)
@@ -77,10 +77,10 @@ def has_room(pair: HolePair, radius: float, tip_angle: float = needle.TIP_ANGLE)
 
 
 def largest_size(pair: HolePair, tip_angle: float) -> float:
-    """Return the largest `needle_size` at which the smallest needle still can be driven through.
+    """Return the largest `needle_size` at which the smallest needle can still be driven through.
 
     Returns:
-        A share of the radius in thousandths, rounded down; negative if the scene's own radius is
+        A share of the radius, rounded down to thousandths; negative if the scene's own radius is
         too small.
     """
     low = -1.0  # twice the radius
@@ -137,7 +137,7 @@ def _refuse_narrow(config: TaskConfig) -> None:
 
 
 def corners(scene: SceneConfig, axes: RandomisationConfig) -> Iterator[Placement]:
-    """Yield the phantom's furthest places with each pair that may be sewn."""
+    """Yield the phantom's extreme placements with each pair that may be sewn."""
     shift = axes.phantom_shift / 1e3
     turn = math.radians(axes.phantom_turn)
     for index in _pairs(scene, axes):
@@ -155,7 +155,7 @@ def _placed(scene: SceneConfig, where: Placement) -> HolePair:
 
 @functools.lru_cache(maxsize=32)
 def _refuse_hidden(scene: SceneConfig, axes: RandomisationConfig) -> None:
-    """Refuse places of the phantom at which a hole leaves the endoscope's image."""
+    """Refuse placements of the phantom at which a hole leaves the endoscope's image."""
     for where in corners(scene, axes):
         pair = _placed(scene, where)
         for view, hole in itertools.product(VIEWS, (pair.entry, pair.exit)):
@@ -172,7 +172,7 @@ def _refuse_hidden(scene: SceneConfig, axes: RandomisationConfig) -> None:
 
 @functools.lru_cache(maxsize=32)
 def _camera(scene: SceneConfig, view: str) -> tuple[Matrix, Matrix, float]:
-    """Return a camera's place (3,), rotation (3, 3) and tangent of half its field of view."""
+    """Return a camera's position (3,), rotation (3, 3) and tangent of half its field of view."""
     model = build_scene(scene).model
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -191,7 +191,7 @@ def in_view(scene: SceneConfig, view: str, point: Point) -> bool:
 
 @functools.lru_cache(maxsize=32)
 def _refuse_unreachable(scene: SceneConfig, axes: RandomisationConfig) -> None:
-    """Refuse places of the phantom at which an arm cannot follow the needle's way."""
+    """Refuse placements of the phantom at which an arm cannot follow the needle's path."""
     sizes = sorted({1.0 - axes.needle_size, 1.0 + axes.needle_size})
     angles = [TIP_ANGLES[arc] for arc in axes.arcs]
     for where, size, tip_angle in itertools.product(corners(scene, axes), sizes, angles):

@@ -1,9 +1,9 @@
-"""Force plate: the net force of needle and instruments on the phantom, as one under it would show.
+"""Force plate: the net force of needle and instruments on the phantom, as a plate would show it.
 
 Contact forces are not part of a state that ends with MuJoCo's position stage, and computing them in
-place would change the state's warm start. They are computed on data of the plate's own. In soft
-tissue the holds that the needle hangs in count as well (`envs.tissue`). The thread is not meant:
-what it pulls in the tissue is not counted.
+place would change the state's warm start. They are therefore computed on the plate's own data. In
+soft tissue the holds on the needle are included (`envs.tissue`); the thread's pull on the tissue is
+not.
 """
 
 import mujoco
@@ -19,7 +19,7 @@ class ForcePlate:
     """A force plate under the phantom; see the module's docstring.
 
     Args:
-        model: the env's model, its own copy where the env has one.
+        model: the env's model, its own copy if the env has one.
         tissue: the simulation's soft tissue, if it has any.
     """
 
@@ -37,7 +37,7 @@ class ForcePlate:
         self._presses = (model.body_weldid[of_geom] != 0) & ~thread
 
     def force(self, data: mujoco.MjData) -> float:
-        """Return the size of the net force on the tissue [N]."""
+        """Return the magnitude of the net force on the tissue [N]."""
         holds = self._soft is not None and self._soft.stage != OUTSIDE
         if not holds and not self._touching(data).any():
             return 0.0
@@ -47,7 +47,7 @@ class ForcePlate:
         return float(np.linalg.norm(self.net(self._scratch)))
 
     def net(self, data: mujoco.MjData) -> NDArray[np.float64]:
-        """Return the net force in world (3,) [N] of data whose forces have been computed."""
+        """Return the net force in world (3,) [N] from data whose forces have been computed."""
         net = np.zeros(3) if self._soft is None else -self._soft.hold_force(data)
         wrench = np.empty(6)
         for index in np.flatnonzero(self._touching(data)):
@@ -59,7 +59,7 @@ class ForcePlate:
         return net
 
     def _touching(self, data: mujoco.MjData) -> NDArray[np.bool_]:
-        """Return which contacts are of the tissue with the needle or an instrument, (contacts,)."""
+        """Return which contacts are between tissue and needle or an instrument, (contacts,)."""
         one = data.contact.geom[:, 0]
         other = data.contact.geom[:, 1]
         touching: NDArray[np.bool_] = (self._tissue[one] & self._presses[other]) | (

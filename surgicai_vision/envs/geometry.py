@@ -1,33 +1,33 @@
 """Geometry of the stitch: grasp frames on the needle, the path through the holes, and the goals.
 
 A grasp: the jaws approach along the normal of the needle's plane from its +z side and close in the
-radial direction. One such grasp serves the pick-up from the tissue, the drive through the holes and
-the pull. With the tool's frame (z along the jaws, y across them, x their hinge) and θ the grasped
-point's angle: y = ± radial(θ), z = -normal, tip frame at `GRASP_DEPTH` above the plane. PSM2 takes
-+radial, PSM1 -radial: the signs for which no joint limit is met on the whole path (and those of
-SurgicAI's demonstrations).
+radial direction. The same kind of grasp picks the needle up from the tissue, drives it through the
+holes and pulls it out. In the tool's frame (z along the jaws, y across them, x along their hinge),
+with θ the grasped point's angle: y = ± radial(θ), z = -normal, tip frame at `GRASP_DEPTH` above the
+plane. PSM2 uses +radial, PSM1 -radial: with these signs no joint limit is met on the whole path
+(SurgicAI's demonstrations use the same).
 
-A needle of another arc keeps the shares: the goals stand at 5/6 and 7/8 of it (100° and 105° of
-120°), so that as large a part of it is out of the exit; and PSM2 grasps it as far before the
-insertion's goal as the 120° needle, up to 95°, because that decides how its wrist stands. (From
-the base of a half circle the roll would have to go 125° past its limit.)
+On a needle of another arc the goals keep their shares, 5/6 and 7/8 of it (100° and 105° of 120°),
+so that the same share of it is out of the exit. PSM2 grasps it as far before the insertion's goal
+as the 120° needle, up to 95°, because this distance decides the pose of its wrist. (From the base
+of a half circle the roll would have to go 125° past its limit.)
 
 The path: the holes of layout `simple` lie 7.8 mm apart on flanks tilted 46.1°, their axes 43.9°
 below the horizontal. A circle of the needle's radius R through both centres has its centre √(R² -
-(gap/2)²) = 9.4 mm above their middle and runs there at asin(gap / 2R) = 22.6° to the horizontal:
-21° off the holes' axes. No rigid arc of this radius is perpendicular at both holes, so the needle
-starts perpendicular at the entry (place), turns those 21° about its tip while the tip enters, then
-follows the circle. In the 3.8 mm openings the needle's skin keeps at least 0.7 mm of clearance all
-the way (0.71 to 0.82 mm by pair; `tests/scene/test_scene.py` measures it).
+(gap/2)²) = 9.4 mm above their midpoint. In the holes it runs at asin(gap / 2R) = 22.6° to the
+horizontal, 21° off their axes. No rigid arc of this radius is perpendicular at both holes, so the
+needle starts perpendicular at the entry (place), turns those 21° about its tip while the tip
+enters, then follows the circle. In the 3.8 mm openings the needle's surface keeps at least 0.7 mm
+of clearance all the way (0.71 to 0.82 mm by pair; `tests/scene/test_scene.py` measures it).
 
 Room for PSM2's jaws: at the end of the insertion the needle's point at
-`angle_at_entry(INSERT_ANGLE, INSERT_DEPTH)` is in the entry, 100° - 11.3° - 2 asin(gap / 2R), and
-the jaws, `PAD_WIDTH` wide, must still be outside. With the `EXTRA` drive that makes room for PSM1
-this leaves grasps up to 27° in `simple` and up to 8° to 15° in `3dmed_straight` (gaps 9.8 to 10.9
-mm): there PSM2 grasps nearer the base. The gaps of `3dmed` (12.2 to 14.1 mm, 74° to 88° of the
-needle's 120°) leave no room: a third of this needle cannot stand out of the exit while
-PSM2 holds its base. Those holes are for their challenge's needle of 133°. In `3dmed` grasp and
-place are possible; what follows is refused.
+`angle_at_entry(INSERT_ANGLE, INSERT_DEPTH)` = 100° - 11.3° - 2 asin(gap / 2R) is in the entry, and
+the jaws, `PAD_WIDTH` wide, must still be outside. With the extra drive `EXTRA` that makes room for
+PSM1, this leaves grasps up to 27° in `simple` and up to 8° to 15° in `3dmed_straight` (gaps 9.8 to
+10.9 mm), where PSM2 grasps nearer the base. The gaps of `3dmed` (12.2 to 14.1 mm, 74° to 88° of the
+needle's 120°) leave no room: a third of this needle cannot protrude from the exit while PSM2 holds
+its base. Those holes are meant for their challenge's needle of 133°. In `3dmed` grasp and place are
+possible; the later subtasks are refused.
 """
 
 import functools
@@ -52,18 +52,18 @@ GRASP_SIGNS = {PSM1: -1.0, PSM2: 1.0}
 INSERT_ANGLE = math.radians(100.0)
 """The point of a 120° needle that the insertion brings beyond the exit (released code)."""
 COME_ROUND = math.radians(10.0)
-"""What must be left of the turn that would bring a long needle's tip to the exit's plane."""
+"""Turn that must remain before a long needle's tip would reach the exit's plane."""
 INSERT_DEPTH = 0.002
-"""How far beyond the exit it brings it [m]."""
+"""How far beyond the exit the insertion brings that point [m]."""
 EXTRA = 0.0014
-"""How far the expert goes on past that goal, to make room for PSM1's jaws [m]."""
+"""How far the expert drives on past that goal, to make room for PSM1's jaws [m]."""
 FIRST_GRASP = math.radians(6.5)
-"""Angle of the scene's own needle from which on a grasp off by its error has the needle between
-the pads; of another one the angle of as long an arc."""
+"""Smallest angle on the scene's own needle at which a grasp, off by its error, has the needle
+between the pads; on another needle, the angle of an equally long arc."""
 HANDOFF_ANGLE = math.radians(105.0)
 """The point of a 120° needle that PSM1 grasps (released code)."""
 PULLOUT_SHIFT = np.array([0.030, 0.0, 0.030])
-"""End of the pull-out from the exit [m], in world for a phantom that is not turned (released
+"""End of the pull-out relative to the exit [m], in world for a phantom that is not turned (released
 code)."""
 PULLOUT_TURN = math.radians(-50.0)
 """Rotation of the handoff grasp about the wound at that end (released code)."""
@@ -173,7 +173,7 @@ class Stitch:
         return _needle_pose(angle_at_entry, radial, self.centre, self.wound)
 
     def angle_at_entry(self, angle: float, beyond: float) -> float:
-        """Return the needle angle in the entry when `angle` is `beyond` the exit [m]."""
+        """Return the needle angle in the entry when `angle` is `beyond` [m] past the exit."""
         return angle - beyond / self.radius - 2 * self.half
 
     def place(self) -> Matrix:
@@ -194,7 +194,7 @@ class Stitch:
     def pulled(self) -> Matrix:
         """Return the goal of the pull-out.
 
-        The handoff point is at the end point, turned with the inserted needle.
+        The handoff point is at the end point, and the inserted needle is turned by `PULLOUT_TURN`.
         """
         pose = np.eye(4)
         pose[:3, :3] = rotvec_to_matrix(PULLOUT_TURN * self.wound) @ self.inserted()[:3, :3]
@@ -213,7 +213,7 @@ class Stitch:
 
     @property
     def ahead(self) -> float:
-        """Return how far PSM2's grasp is ahead of that on a 120° needle [rad]."""
+        """Return by how much PSM2's grasp angle exceeds that on a 120° needle [rad]."""
         return self.insert_angle - INSERT_ANGLE
 
     @property
@@ -225,15 +225,15 @@ class Stitch:
     def possible(self) -> bool:
         """Return True if the holes leave room for PSM2's jaws.
 
-        Where they do not, only grasp and place can be done.
+        If they do not, only grasp and place are possible.
         """
         return self.last_grasp >= self.first_grasp
 
     @property
     def comes_out(self) -> bool:
-        """Return True if the tip has not come round to the exit's plane when the base is out.
+        """Return True if the base comes out before the tip has come round to the exit's plane.
 
-        A point at α from the circle's bottom is R (cos(half + tilt) - cos(α + tilt)) over that
+        A point at α from the circle's bottom is R (cos(half + tilt) - cos(α + tilt)) above that
         plane; the tip is then at half + tip_angle.
         """
         return self.tip_angle + COME_ROUND < 2 * (math.pi - self.half - abs(self.pair.exit.tilt))
@@ -241,8 +241,8 @@ class Stitch:
     def grasps(self, low: float, high: float) -> tuple[float, float]:
         """Return the range of grasp angles [rad] on this needle for one on a 120° needle.
 
-        It lies as far before the insertion's goal, and nearer to the base where the stitch leaves
-        no room for all of it.
+        It lies as far before the insertion's goal, or nearer to the base if the stitch leaves no
+        room for all of it.
         """
         if not self.possible:
             return low + self.ahead, high + self.ahead

@@ -1,8 +1,8 @@
 """Goal envs: obs_type "goal", for hindsight experience replay (HER).
 
 They follow gymnasium-robotics' `GoalEnv`: the reward, the termination and the truncation of a step
-are functions of the achieved goal, the desired goal and the info, so that a replay buffer can ask
-for them with another desired goal. All three take single goals (8,) or batches (batch, 8).
+are functions of the achieved goal, the desired goal and the info, so that a replay buffer can
+compute them for another desired goal. All three take single goals (8,) or batches (batch, 8).
 """
 
 from collections.abc import Sequence
@@ -27,10 +27,10 @@ class GoalSuturingEnv(SuturingEnv):
     def compute_reward(
         self, achieved_goal: Goals, desired_goal: Goals, info: Infos | None = None
     ) -> NDArray[np.float64]:
-        """Return the rewards of goals; on what was observed it is the reward of the step.
+        """Return the rewards of goals; for the observed goals it is the reward of the step.
 
-        A relabelled goal asks for what held when it was achieved: an insertion that missed the
-        holes is no example of one that passed them, but is one of reaching that pose.
+        A relabelled goal requires what held when it was achieved: an insertion that missed the
+        holes is not an example of passing them, but it is one of reaching that pose.
         """
         if self.config.reward == "sparse":
             return np.where(self._reached(achieved_goal, desired_goal), 0.0, -1.0)
@@ -50,12 +50,12 @@ class GoalSuturingEnv(SuturingEnv):
     def compute_truncated(
         self, achieved_goal: Goals, desired_goal: Goals, info: Infos | None = None
     ) -> NDArray[np.bool_]:
-        """Return whether the time of the present episode is over; no goal changes that."""
+        """Return whether the present episode has reached its time limit, whatever the goals."""
         is_over = self._truncates and self.simulation.task_state.steps >= self.config.max_steps
         return np.full(np.shape(achieved_goal)[:-1], is_over)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
-        """Take one step; a reward that is not sparse is that of the observed, rounded goals."""
+        """Take one step; a non-sparse reward is computed from the observed, rounded goals."""
         seen, reward, terminated, truncated, info = super().step(action)
         if self.config.reward != "sparse":
             assert isinstance(seen, dict)
@@ -65,7 +65,7 @@ class GoalSuturingEnv(SuturingEnv):
         return seen, reward, terminated, truncated, info
 
     def _reached(self, achieved_goal: Goals, desired_goal: Goals) -> NDArray[np.bool_]:
-        """Return whether goals are within the tolerance and what else they ask for holds."""
+        """Return whether goals are within the tolerance and their other conditions hold."""
         distance, turn = observation.goal_errors(achieved_goal, desired_goal)
         tolerance = self.tolerance()
         is_near = (distance <= tolerance.distance) & (turn <= tolerance.angle)
@@ -86,7 +86,7 @@ class GoalSuture(GoalSuturingEnv, Suture):
 
 
 def _meets(achieved_goal: Goals, desired_goal: Goals) -> NDArray[np.bool_]:
-    """Return whether what goals ask for besides the pose holds, () or (batch,)."""
+    """Return whether the conditions of goals other than the pose hold, () or (batch,)."""
     met: NDArray[np.bool_] = np.asarray(achieved_goal)[..., 7] >= np.asarray(desired_goal)[..., 7]
     return met
 

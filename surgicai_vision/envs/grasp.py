@@ -24,19 +24,19 @@ SPREAD_Y = 0.020
 SPREAD_TURN = math.radians(30.0)
 """Half width of its rotation [rad]."""
 REACH = needle.RADIUS * math.cos(math.pi - needle.TIP_ANGLE - SPREAD_TURN)
-"""How far from its centre the scene's own needle may reach towards the ridge [m], whose foot is
-then 1 mm away: its tip lies at 180° - 120° from the phantom's x axis, or as much nearer to it as it
-may be turned. A needle that would reach further lies as much further away; the largest, a half
-circle, then still has 1.2 mm to the pad's edge."""
+"""How far the scene's own needle may reach from its centre towards the ridge [m], whose foot is
+then 1 mm away: its tip lies at 180° - 120° from the phantom's x axis, or nearer to it by as much as
+the needle may be turned. A needle that would reach further lies that much further away; the
+largest, a half circle, is then still 1.2 mm from the pad's edge."""
 
 
 def lying_needle(
     simulation: Simulation, stitch: Stitch, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw T_world_needle (4, 4) of a needle that lies on the tissue, wherever that is.
+    """Draw T_world_needle (4, 4) of a needle that lies on the tissue, wherever the tissue is.
 
-    Where PSM2 grasps it, it lies as a 120° needle does: from the other end of a half circle the
-    wrist could not turn it upright.
+    At PSM2's grasp point it is oriented as a 120° needle would be: from the other end of a half
+    circle the wrist could not turn it upright.
     """
     shape = simulation.shape
     pose = np.eye(4)
@@ -65,7 +65,7 @@ class Grasp(Subtask):
     demands = MappingProxyType({"paper": Demands(contact=True), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
-        """Put the needle on the tissue, both arms at home."""
+        """Put the needle on the tissue, with both arms at home."""
         simulation.pose_needle(poses.flat(lying_needle(simulation, stitch, rng)))
         simulation.task_state.grasp_angle = rng.uniform(*stitch.grasps(*GRASP_ANGLES))
         simulation.settle(20)
@@ -78,7 +78,7 @@ class Grasp(Subtask):
         )
 
     def targets(self, simulation: Simulation, stitch: Stitch) -> tuple[tuple[Pose, Pose], ...]:
-        """Return the episode's target, and the nearest of those that episodes draw."""
+        """Return the episode's target, and the nearest one that an episode could draw."""
         drawn = self.target(simulation, stitch)
         x, y, _ = poses.position(poses.relative(simulation.needle(), drawn[0]))
         low, high = stitch.grasps(*GRASP_ANGLES)
@@ -93,7 +93,7 @@ def grasp_goal(simulation: Simulation, arm: str, angle: float) -> Pose:
 
 @functools.lru_cache(maxsize=64)
 def _grasp_frame(arm: str, angle: float, radius: float) -> Pose:
-    """Return T_needle_grasp: `grasp_in_needle` with the jaws' grasp point for its origin."""
+    """Return T_needle_grasp: `grasp_in_needle` with the jaws' grasp point as its origin."""
     shift = np.eye(4)
     shift[2, 3] = GRASP_DEPTH
     return poses.flat(grasp_in_needle(arm, angle, radius=radius) @ shift)

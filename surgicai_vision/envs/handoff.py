@@ -17,14 +17,14 @@ from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
 from surgicai_vision.scene.kinematics import Pose
 
 DRIVEN = (0.0, 0.002)
-"""How far the insertion went past its goal [m]: room for PSM1's jaws beside the exit."""
+"""How far the insertion went past its goal [m]: room for PSM1's jaws next to the exit."""
 OFF_PATH = 0.0003
-"""Scatter of the inserted needle about the circle [m], inside the openings' clearance."""
+"""Scatter of the inserted needle about the circle [m], within the clearance of the openings."""
 OFF_TURN = math.radians(2.0)
 """Scatter of its rotation [rad]."""
 
 STRAIGHT = math.radians(4.0)
-"""How far the grip may have turned the needle when it closed [rad]."""
+"""How far the closing jaws may have turned the needle [rad]."""
 
 
 def inserted_needle(stitch: Stitch, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -46,7 +46,7 @@ class Handoff(Subtask):
     demands = MappingProxyType({"paper": Demands(contact=True), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
-        """Hold the inserted needle with PSM2, PSM1 at home."""
+        """Hold the inserted needle with PSM2, with PSM1 at home."""
         needle_pose = inserted_needle(stitch, rng)
         simulation.task_state.holes_passed = self.passed_at_start
         held = hold_needle(

@@ -7,7 +7,7 @@ Two conditions must agree, so that tunnelling or teleporting never counts.
   and the tip never moves further than `JUMP` in one control step.
 * In space: the needle's arc crosses both planes inside the openings now.
 
-In soft tissue, which has no openings, the tissue's own events say it (`envs.tissue`): the flank of
+In soft tissue, which has no openings, the tissue's own events decide (`envs.tissue`): the flank of
 the entry is pierced, then that of the exit, then the needle is out.
 """
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from surgicai_vision.envs.tissue import Tissue
 
 JUMP = 0.004
-"""Furthest the tip can move in one control step [m]: eight times the default step size."""
+"""Furthest that the tip can move in one control step [m]: eight times the default step size."""
 OUT = 3
-"""`TaskState.holes_passed` of a needle whose base has left the exit too."""
+"""`TaskState.holes_passed` of a needle whose base has left the exit as well."""
 EJECTED = 5.0
 """A distance in one control step [m] that no fall explains: the contact solver shot the needle away
 (250 m/s)."""
@@ -37,9 +37,9 @@ class NeedlePose(Protocol):
     """The soft tissue it pierces, None in tissue with channels."""
 
     radius: float
-    """Of the needle's arc [m]."""
+    """Radius of the needle's arc [m]."""
     tip_angle: float
-    """Of its tip [rad]."""
+    """Angle of its tip [rad]."""
 
     def needle(self) -> Pose:
         """Return T_world_needle."""
@@ -77,21 +77,21 @@ def update(now: NeedlePose, state: TaskState, pair: HolePair) -> None:
 
 
 def remember_tip(now: NeedlePose, state: TaskState) -> None:
-    """Watch the needle's tip from its present place on."""
+    """Start tracking the needle's tip at its present position."""
     state.needle_tip = now.needle_point(now.tip_angle)
 
 
 def crossing(before: Point, now: Point, hole: Hole, *, inward: bool) -> tuple[float, float] | None:
-    """Return where the way from `before` to `now` crosses a hole's plane inside its opening.
+    """Return where the path from `before` to `now` crosses a hole's plane inside its opening.
 
     Args:
-        before: where the way begins, in world [m].
+        before: where the path begins, in world [m].
         now: where it ends.
         hole: the hole.
-        inward: True for ways into the tissue, False for ways out of it.
+        inward: True for paths into the tissue, False for paths out of it.
 
     Returns:
-        (x, y) in the hole's frame [m], or None where the way does not cross the opening in this
+        (x, y) in the hole's frame [m], or None if the path does not cross the opening in this
         direction.
     """
     start = hole.height(before)
@@ -125,7 +125,7 @@ def leaves(now: NeedlePose, hole: Hole) -> bool:
 
 
 def is_out(now: NeedlePose, pair: HolePair) -> bool:
-    """Return True if the whole needle is beyond the exit's plane: its lowest point is."""
+    """Return True if the whole needle, that is its lowest point, is beyond the exit's plane."""
     height, reach, phase = _heights(now, pair.exit)
     low = math.remainder(phase - math.pi / 2, 2 * math.pi)
     lowest = (
@@ -137,10 +137,10 @@ def is_out(now: NeedlePose, pair: HolePair) -> bool:
 
 
 def _crosses(now: NeedlePose, hole: Hole, *, inward: bool) -> bool:
-    """Return True if the needle's arc crosses the opening; in closed form, for every control step.
+    """Return True if the needle's arc crosses the opening; in closed form, as it runs every step.
 
     Along the arc the height over the plane is a + R (c sin θ - b cos θ) = a + reach sin(θ - φ); it
-    rises through 0 at one angle and falls through it at one.
+    rises through 0 at one angle and falls through it at another.
     """
     height, reach, phase = _heights(now, hole)
     if abs(height) >= reach:
@@ -165,7 +165,7 @@ def _heights(now: NeedlePose, hole: Hole) -> tuple[float, float, float]:
 
 
 def _in_opening(point: Point, hole: Hole) -> tuple[float, float] | None:
-    """Return (x, y) in the hole's frame [m] of a point of its plane, or None outside the opening.
+    """Return (x, y) in the hole's frame [m] of a point in its plane, or None outside the opening.
 
     Args:
         point: in world [m].

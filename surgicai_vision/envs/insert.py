@@ -20,7 +20,7 @@ from surgicai_vision.scene.kinematics import Pose
 START_SHIFT = 0.0055
 """How far the tip may be off the entry at the start [m] (paper)."""
 START_TURN = math.radians(12.0)
-"""How far the needle may be turned then [rad] (paper)."""
+"""How far the needle may be turned at the start [rad] (paper)."""
 
 
 class Insert(Subtask):
@@ -52,7 +52,7 @@ class Insert(Subtask):
         return held and not simulation.touches_phantom(needle=True)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
-        """Return the needle's frame at the goal's angle and where it ends."""
+        """Return the needle's frame at the goal's angle and the goal of that frame."""
         return poses.compose(
             simulation.needle(), needle_frame_flat(stitch.insert_angle, stitch.radius)
         ), stitch.insert_point

@@ -1,7 +1,7 @@
-"""Looks: an episode's appearance and what lies about in it, as numbers of its randomisation.
+"""Looks: an episode's appearance and distractors, as numbers of its randomisation.
 
-Both are drawn whichever is on, and both are an identity with a seed, of which everything seen
-follows (`scene.visual.appearance`, `scene.visual.distractors`).
+Both are always drawn, whichever is on. Each is an identity with a seed, from which everything
+visible follows (`scene.visual.appearance`, `scene.visual.distractors`).
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ FAMILIES = {names.TRAIN: names.TRAIN_APPEARANCES, names.HELDOUT: names.HELDOUT_A
 
 
 def draw(config: RandomisationConfig, rng: np.random.Generator) -> Mapping[str, tuple[float, ...]]:
-    """Draw a look alone: axis → its numbers, of the axes that `config` has on."""
+    """Draw only a look: axis → its numbers, for the axes that are on in `config`."""
     drawn = {
         "appearance": draw_appearance(config, rng).numbers[:2],
         "distractors": draw_litter(config, rng).numbers,
@@ -28,7 +28,7 @@ def draw(config: RandomisationConfig, rng: np.random.Generator) -> Mapping[str, 
 
 
 def draw_appearance(config: RandomisationConfig, rng: np.random.Generator) -> Appearance:
-    """Draw one episode's appearance; it takes as many numbers whatever `config` says."""
+    """Draw one episode's appearance; `config` does not change how many random numbers it uses."""
     one = _draw(config.appearance, rng)
     other = _draw(names.HELDOUT if config.appearance_shift else "", rng)
     return dataclasses.replace(
@@ -37,7 +37,7 @@ def draw_appearance(config: RandomisationConfig, rng: np.random.Generator) -> Ap
 
 
 def _draw(families: str, rng: np.random.Generator) -> Appearance:
-    """Draw an appearance of a family or a set of them; the plain one of ""."""
+    """Draw an appearance of a family or a set of families; "" gives the plain one."""
     share = float(rng.uniform())
     seed = int(rng.integers(SEEDS))
     if not families:
@@ -47,7 +47,7 @@ def _draw(families: str, rng: np.random.Generator) -> Appearance:
 
 
 def draw_litter(config: RandomisationConfig, rng: np.random.Generator) -> Litter:
-    """Draw what lies about in one episode: up to `config.distractors` things."""
+    """Draw the distractors of one episode: up to `config.distractors` objects."""
     share = float(rng.uniform())
     seed = int(rng.integers(SEEDS))
     count = min(int(share * (config.distractors + 1)), MOST)

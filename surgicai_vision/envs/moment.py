@@ -1,4 +1,4 @@
-"""Moment: what a person is told of one control step, in videos and on pages."""
+"""Moment: what videos and pages show about one control step."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -16,13 +16,13 @@ class Moment:
 
     Attributes:
         step: control steps taken so far; 0 at the start.
-        subtask: the subtask that is on.
-        arm: its arm.
+        subtask: the present subtask.
+        arm: its active arm.
         distance: from the goal [m].
         angle: from the goal [rad].
         contact: both pads of the active jaws touch the needle.
         force: net force of needle and instruments on the tissue [N] (`EpisodeMonitor.force`).
-        stages: of the whole procedure, subtasks that succeeded so far in their order.
+        stages: subtasks of the whole procedure that have succeeded so far, in their order.
         success: the task has succeeded.
     """
 
@@ -42,8 +42,8 @@ def present_moment(env: "SuturingEnv", info: Info, monitor: "EpisodeMonitor", st
 
     Args:
         env: the env.
-        info: of its last reset or step.
-        monitor: has seen both.
+        info: info of its last reset or step.
+        monitor: a monitor that has seen both.
         step: control steps taken so far.
     """
     subtask = env.subtask

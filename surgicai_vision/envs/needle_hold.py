@@ -1,9 +1,9 @@
 """Needle hold: soft tissue holds the needle's shaft at up to two places.
 
 Each hold ties a carrier, a point that slides along the needle's arc with friction, to an anchor in
-the tissue. A hold is an elastic spring; its anchor gives way across the shaft as
-`TissueForces.give_way` says. One of the two can hold the middle of a path: its anchor then moves
-with the path, and keeps what it has given way.
+the tissue. A hold is an elastic spring; its anchor gives way across the shaft as defined by
+`TissueForces.give_way`. One of the two can hold the middle of a path: its anchor then moves with
+the path and keeps the displacement by which it has given way.
 """
 
 import math
@@ -17,9 +17,9 @@ from surgicai_vision.scene import tissue as elements
 from surgicai_vision.scene.holes import Point
 
 NEITHER = -1
-"""No hold holds the middle of a path."""
+"""Neither hold is at the middle of a path."""
 SHORTEST = 4
-"""Points of a path whose middle can be held."""
+"""Fewest points of a path whose middle can be held."""
 
 
 class NeedleHolds:
@@ -34,7 +34,7 @@ class NeedleHolds:
     """
 
     SIZE: ClassVar[int] = 14
-    """Numbers of the packed holds."""
+    """Number of values in the packed holds."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class NeedleHolds:
         self.equalities = [model.equality(f"hold_{index}").id for index in range(2)]
 
     def meet(self) -> None:
-        """Follow a randomised model: the needle's radius and mass."""
+        """Adapt to a randomised model: the needle's radius and mass."""
         model = self._model
         for site, body, equality in zip(self._site, self._carrier, self.equalities, strict=True):
             model.site_pos[site] = (-self._arc.radius, 0.0, 0.0)
@@ -79,7 +79,7 @@ class NeedleHolds:
     def angle(self, index: int) -> float:
         """Return the angle of the needle's point that passes a hold [rad].
 
-        That is not the carrier's: by its friction the shaft drags the tissue along, before it
+        This is not the carrier's angle: by friction the shaft drags the tissue along before it
         slides.
         """
         return self._arc.nearest(self._anchors[index])
@@ -96,7 +96,7 @@ class NeedleHolds:
         return self._ridge.to_phantom((x, y, z))
 
     def anchor(self, index: int) -> Point:
-        """Return where it is held, in the phantom's frame [m]."""
+        """Return where a hold is anchored, in the phantom's frame [m]."""
         return self._anchors[index]
 
     def hold(self, index: int, angle: float, anchor: Point) -> None:
@@ -113,7 +113,7 @@ class NeedleHolds:
     def hold_middle(self, index: int, path: Sequence[Point], share: float) -> None:
         """Hold the shaft at a share of a path in the phantom's frame.
 
-        A path too short for it is not held.
+        A path that is too short for this is not held.
         """
         if len(path) < SHORTEST:
             self.release(index)
@@ -172,7 +172,7 @@ class NeedleHolds:
         return tears
 
     def pack(self) -> list[float]:
-        """Return what MuJoCo's own state does not have, as `SIZE` numbers."""
+        """Return what MuJoCo's own state does not contain, as `SIZE` numbers."""
         return [
             *self._anchors[0],
             *self._anchors[1],
@@ -183,7 +183,7 @@ class NeedleHolds:
         ]
 
     def unpack(self, values: Sequence[float]) -> None:
-        """Take what `pack` returned; MuJoCo's state must be set already."""
+        """Restore what `pack` returned; MuJoCo's state must already be set."""
         self._anchors = [
             (values[0], values[1], values[2]),
             (values[3], values[4], values[5]),

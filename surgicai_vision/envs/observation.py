@@ -6,14 +6,14 @@
   goal, so it never wraps.
 * `goal`: Dict for hindsight relabelling: `observation` (7,), `achieved_goal` (8,) and
   `desired_goal` (8,). The goals are the measured frame that success is judged by and its goal, in
-  world: x y z [m], rotation vector, jaw, and 1 where what success needs besides the pose holds
+  world: x y z [m], rotation vector, jaw, and 1 if the success conditions other than the pose hold
   (contact, holes passed, needle out), else 0.
-* `relative`: (24,) float32: what `goal` shows, relative and in the active arm's base, as a network
-  learns from it; see `envs.relative`.
+* `relative`: (24,) float32: the content of `goal`, relative and in the active arm's base, in a form
+  suited to learning; see `envs.relative`.
 * `pixels`: Dict of images: "front" is (height, width, 3) uint8 RGB; with depth=True also
   "front_depth" (height, width, 1) float32 [m], with segmentation=True also "front_segmentation"
   (height, width, 1) uint8.
-* `pixels_agent_pos`: the same and `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw
+* `pixels_agent_pos`: the same plus `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw
   [rad] of the active arm's measured tip in its own base, as a dVRK reports it. In action mode
   "absolute" `agent_pos` is both arms' (16,); see `envs.absolute`.
 
@@ -81,17 +81,17 @@ class ObservationConfig:
 
     @property
     def visual(self) -> bool:
-        """Return True if it holds images."""
+        """Return True if observations contain images."""
         return self.obs_type in ("pixels", "pixels_agent_pos")
 
     @property
     def shows_agent_pos(self) -> bool:
-        """Return True if the active arm's measured pose stands beside the images."""
+        """Return True if `agent_pos` is given alongside the images."""
         return self.obs_type == "pixels_agent_pos"
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """Return what is rendered of each camera, a part of `names.MODALITIES`."""
+        """Return what is rendered for each camera, a subset of `names.MODALITIES`."""
         shown = {names.RGB: True, names.DEPTH: self.depth, names.SEGMENTATION: self.segmentation}
         return tuple(modality for modality in names.MODALITIES if shown[modality])
 
@@ -140,13 +140,13 @@ def seven(arm: str, pose: Pose, jaw: float, scale: float = 1.0) -> list[float]:
 
 
 def setpoint(now: Pose, jaw: float, told: Pose, told_jaw: float) -> NDArray[np.float32]:
-    """Return how far a set point lies from what is measured, (7,) [m, rad].
+    """Return the offset of a set point from what is measured, (7,) [m, rad].
 
     Args:
         now: measured tip pose in the arm's base.
         jaw: measured jaw angle [rad].
-        told: the tip pose that it is told to take.
-        told_jaw: the jaw angle that it is told to take [rad].
+        told: commanded tip pose in the arm's base.
+        told_jaw: commanded jaw angle [rad].
     """
     shift = [b - a for a, b in zip(poses.position(now), poses.position(told), strict=True)]
     turn = multiply_flat(poses.rotation(told), transpose_flat(poses.rotation(now)))
@@ -172,7 +172,7 @@ def state_vector_in_world(
     Args:
         arm: the active arm.
         base: T_world_base.
-        tip: T_world_tip; the goal is where the tip is when `achieved`, moving with it, is at
+        tip: T_world_tip; the goal is the tip pose at which `achieved`, moving with the tip, is at
             `desired`.
         achieved: the frame that success is judged by.
         desired: where it should be.
@@ -182,8 +182,8 @@ def state_vector_in_world(
     tx, ty, tz, r0, r1, r2, r3, r4, r5, r6, r7, r8 = tip
     ax, ay, az, a0, a1, a2, a3, a4, a5, a6, a7, a8 = achieved
     gx, gy, gz, g0, g1, g2, g3, g4, g5, g6, g7, g8 = desired
-    # The turn from achieved to desired, the tip in the base, the way to the goal in world and in
-    # the base.
+    # The turn from achieved to desired, the tip in the base, the translation to the goal in world
+    # and in the base.
     d0 = g0 * a0 + g1 * a1 + g2 * a2
     d1 = g0 * a3 + g1 * a4 + g2 * a5
     d2 = g0 * a6 + g1 * a7 + g2 * a8
@@ -258,7 +258,7 @@ def _roll(sine: float, cosine: float) -> float:
 def goal_vector(pose: Pose, jaw: float, met: bool) -> NDArray[np.float32]:
     """Return a pose in world as a goal (8,).
 
-    x y z [m], rotation vector [rad], jaw [rad], and 1 where what else success needs holds.
+    x y z [m], rotation vector [rad], jaw [rad], and 1 if the other success conditions hold.
     """
     turn = matrix_to_rotvec_flat(poses.rotation(pose))
     return np.array([*poses.position(pose), *turn, jaw, met], dtype=np.float32)

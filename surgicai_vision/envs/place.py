@@ -25,7 +25,7 @@ from surgicai_vision.scene.kinematics import Pose
 GRASP_SHIFT = 0.0015
 """How far PSM2's grasp may be off at the start of place and insert [m] (paper)."""
 GRASP_TILT = math.radians(12.0)
-"""How far it may be tilted then [rad] (paper)."""
+"""How far that grasp may be tilted [rad] (paper)."""
 
 
 def draw_psm2_grasp(
@@ -36,7 +36,7 @@ def draw_psm2_grasp(
     Args:
         rng: source of the draw.
         needle_pose: T_world_needle (4, 4).
-        stitch: leaves room for some angles.
+        stitch: limits the angles by the room it leaves.
     """
     angle = rng.uniform(*GRASP_ANGLES) + stitch.ahead
     error = draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)

@@ -1,15 +1,15 @@
 """Placement: where the phantom lies in an episode, and which of its hole pairs is sewn.
 
-`Placement(pair, slide, shift, turn)` is one of a phantom; `placed(hole)` and `T_world_phantom` say
-where its parts then are. The phantom turns about the vertical through `PIVOT`, the place of its
-centre in the scene's own model.
+`Placement(pair, slide, shift, turn)` is one placement; `placed(hole)` and `T_world_phantom` say
+where the phantom's parts then are. The phantom turns about the vertical through `PIVOT`, which is
+its centre in the scene's own model.
 
-Where the pair is drawn, the phantom first slides along the wound by `SLIDE` of the way that the
-drawn pair lies beyond the first. In place, pair 4 lies 72 mm beyond pair 1: outside the image of
-every camera, and 104 mm from PSM1's start, for which the expert's hand-off takes 184 of its 200
-steps. Slid by two thirds of it, every pair is in view of the endoscopes and of the camera opposite,
-whatever the shift and the turn (`tests/envs/test_feasibility.py`), and at most 56 mm away. What
-lies on the phantom shifts and turns with it, but does not slide.
+If the pair is drawn, the phantom first slides along the wound by the share `SLIDE` of the distance
+from the first pair to the drawn one. Without the slide, pair 4 lies 72 mm beyond pair 1: outside
+the image of every camera, and 104 mm from PSM1's start, so that the expert's handoff takes 184 of
+its 200 steps. With a slide of two thirds, every pair is in view of the endoscopes and of the
+opposite camera for any shift and turn (`tests/envs/test_feasibility.py`), and at most 56 mm away.
+What lies on the phantom shifts and turns with it, but does not slide.
 """
 
 import dataclasses
@@ -23,9 +23,9 @@ from surgicai_vision.scene.holes import Hole, HolePair, Point
 from surgicai_vision.scene.phantom import ORIGIN
 
 PIVOT = (*ORIGIN, 0.0)
-"""A point of the axis the phantom turns about [m, world]; the axis is vertical."""
+"""A point on the axis about which the phantom turns [m, world]; the axis is vertical."""
 SLIDE = 2 / 3
-"""Share of the drawn pair's way from the first by which the phantom slides back."""
+"""Share of the drawn pair's distance from the first by which the phantom slides back."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Placement:
 
     @property
     def T_world_bed(self) -> NDArray[np.float64]:
-        """Return the pose (4, 4) of what lies on the phantom: as it, without the slide."""
+        """Return the pose (4, 4) of what lies on the phantom: the phantom's without the slide."""
         return self._transform(0.0)
 
     def _transform(self, slide: float) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Poses in plain floats: parts, composition and inversion of the poses of `scene.kinematics`.
 
-A pose is twelve floats: the position, then the rotation row by row. No other module of the envs
-knows the places of these numbers.
+A pose is twelve floats: the position, then the rotation row by row. Most other modules of the envs
+use these functions and do not depend on that order.
 """
 
 from math import sqrt
@@ -108,7 +108,7 @@ def inverse_origin(a: Pose) -> Vector:
 
 
 def gap(a: Pose, point: Vector, b: Pose) -> float:
-    """Return how far `a` puts a point of its frame from the origin of `b` [m]."""
+    """Return the distance from a point in the frame of `a` to the origin of `b` [m]."""
     x, y, z = transform(a, point)
     u, v, w = x - b[0], y - b[1], z - b[2]
     return sqrt(u * u + v * v + w * w)

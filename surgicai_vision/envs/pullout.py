@@ -20,11 +20,11 @@ from surgicai_vision.scene.kinematics import Pose
 GRASP_SHIFT = 0.0015
 """How far PSM1's grasp may be off at the start [m] (paper)."""
 GRASP_TILT = math.radians(20.0)
-"""How far it may be tilted then [rad] (paper)."""
+"""How far that grasp may be tilted [rad] (paper)."""
 RETREAT = 0.025
-"""How far PSM2 is drawn back along its axis after it let go [m]."""
+"""How far PSM2 is drawn back along its axis after letting go [m]."""
 RELEASED_JAW = 0.5
-"""How far its jaw is open then [rad]."""
+"""How far its jaw is then open [rad]."""
 
 
 class Pullout(Subtask):
@@ -41,7 +41,7 @@ class Pullout(Subtask):
     demands = MappingProxyType({"paper": Demands(out=True), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
-        """Hold the inserted needle with PSM1, PSM2 drawn back with open jaws."""
+        """Hold the inserted needle with PSM1, with PSM2 drawn back and its jaws open."""
         needle_pose = inserted_needle(stitch, rng)
         simulation.task_state.holes_passed = self.passed_at_start
         away = draw_psm2_grasp(rng, needle_pose, stitch)
@@ -60,7 +60,7 @@ class Pullout(Subtask):
         return free and not simulation.touches_phantom(needle=False)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
-        """Return the needle's frame at the handoff's angle and where it ends."""
+        """Return the needle's frame at the handoff's angle and the goal of that frame."""
         return poses.compose(
             simulation.needle(), needle_frame_flat(stitch.handoff_angle, stitch.radius)
         ), stitch.pullout_point

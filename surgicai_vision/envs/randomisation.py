@@ -1,8 +1,8 @@
 """Randomisation: what differs from episode to episode besides the start.
 
-`draw` gives one episode's numbers, `apply` writes them into an env's own copy of the model. The
+`draw` returns one episode's numbers, `apply` writes them into an env's own copy of the model. The
 numbers are part of the whole state, so a restored state looks and moves as it did. All axes are
-drawn whichever are on: turning one on leaves the others as they were.
+always drawn, so turning one on leaves the others as they were.
 """
 
 import math
@@ -46,8 +46,8 @@ RIGS = (
     ("endo_left", "endo_right"),
 )
 """Cameras that move as one, about the first. A camera of another distribution takes the draw of
-"front", about its own place. A crop is cut from what its camera sees, at the place that the nominal
-calibration tells: the move is not known to it.
+"front", about its own position. A crop is cut from its camera's image where the nominal calibration
+puts it, without regard to the move.
 """
 TISSUE = ("tissue", "flesh")
 """Materials of one tint."""
@@ -72,8 +72,8 @@ UNITS = MappingProxyType(
         "robot_start": (1e-3,) * 3 * len(names.ARMS),
     }
 )
-"""Axis → what a magnitude of 1 is in each of its numbers (fractions, m, rad; the field of view in
-degrees).
+"""Axis → what a magnitude of 1 means for each of its numbers (fractions, m, rad; the field of view
+in degrees).
 """
 TIP_ANGLES = MappingProxyType(
     dict(zip(NEEDLE_ARCS, (math.radians(degrees) for degrees in (120, 135, 180)), strict=True))
@@ -81,14 +81,14 @@ TIP_ANGLES = MappingProxyType(
 """Arc of the needle → angle of its tip [rad]."""
 CHOICES = ("pair", "needle_arc")
 """Axes that are a choice, one number each: the pair that is sewn, 1 to 4, or 0 for the scene's own;
-the angle of the needle's tip beyond the own one's [rad]."""
+the angle of the needle's tip beyond that of the scene's own needle [rad]."""
 LOOKS = MappingProxyType({"appearance": 2, "appearance_shift": 3, "distractors": 2})
-"""Axes that are only seen → how many numbers hold each: family and seed; share, family and seed;
-count and seed."""
+"""Purely visual axis → how many numbers it has: family and seed; share, family and seed; count and
+seed."""
 STAND = ("phantom", "tray")
 """Bodies that the phantom's placement moves; in the scene's own model they are at the origin."""
 DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0")
-"""What MuJoCo derives from masses and places."""
+"""What MuJoCo derives from masses and positions."""
 _SIZES = {
     **{axis: len(unit) for axis, unit in UNITS.items()},
     **dict.fromkeys(CHOICES, 1),
@@ -99,10 +99,10 @@ _PLACES = {
     axis: slice(start, end) for axis, (start, end) in zip(_SIZES, pairwise(_EDGES), strict=True)
 }
 SIZE = _EDGES[-1]
-"""Numbers of one episode."""
+"""How many numbers an episode has."""
 NOTHING: Draws = (0.0,) * SIZE
 ROUNDING = 1e-6
-"""How far beyond its bounds a number may be, that was stored in less than 64 bits."""
+"""How far beyond its bounds a number stored in fewer than 64 bits may be."""
 WHOLE = ("pair", "appearance", "distractors")
 """Axes whose numbers are whole: choices, counts and seeds."""
 _MOST = {
@@ -112,7 +112,7 @@ _MOST = {
     "appearance_shift": (1.0, len(names.APPEARANCES), appearance.SEEDS - 1),
     "distractors": (distractors.MOST, appearance.SEEDS - 1),
 }
-"""Axis that has no negative numbers → the largest of each."""
+"""Axis without negative numbers → the largest value of each number."""
 _BOUNDS = {axis: (np.zeros(len(most)), np.array(most)) for axis, most in _MOST.items()} | {
     axis: (
         -RANDOMISATION_LIMITS[axis] * np.array(unit),
@@ -120,7 +120,7 @@ _BOUNDS = {axis: (np.zeros(len(most)), np.array(most)) for axis, most in _MOST.i
     )
     for axis, unit in UNITS.items()
 }
-"""Axis → the smallest and the largest of each of its numbers."""
+"""Axis → the smallest and the largest value of each of its numbers."""
 
 
 def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
@@ -129,7 +129,7 @@ def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
     for axis, unit in UNITS.items():
         values += (rng.uniform(-1.0, 1.0, len(unit)) * unit * getattr(config, axis)).tolist()
     pair = int(rng.integers(1, 5))
-    # One number in any case, so that what is drawn next does not depend on the choice.
+    # Always one random number, so that later draws do not depend on the choice.
     arc = config.arcs[int(rng.integers(len(NEEDLE_ARCS))) % len(config.arcs)]
     values += [pair if config.pair == ANY else 0, TIP_ANGLES[arc] - TIP_ANGLES[NEEDLE_ARCS[0]]]
     values += looks.draw_appearance(config, rng).numbers
@@ -142,7 +142,7 @@ def with_numbers(draws: Draws, given: Mapping[str, Sequence[float]]) -> Draws:
 
     Args:
         draws: one episode's numbers.
-        given: axis → its numbers, as `report` has them.
+        given: axis → its numbers, as `report` returns them.
 
     Raises:
         UnknownName: no such axis.
@@ -156,7 +156,7 @@ def with_numbers(draws: Draws, given: Mapping[str, Sequence[float]]) -> Draws:
 
 
 def _checked(axis: str, numbers: object) -> list[float]:
-    """Return an axis's numbers, or refuse such as no episode can have."""
+    """Return an axis's numbers, or refuse numbers that no episode can have."""
     try:
         given = np.array(numbers, dtype=np.float64)
     except (TypeError, ValueError):
@@ -192,7 +192,7 @@ def report(config: RandomisationConfig, draws: Draws) -> dict[str, Array | int]:
 
 
 def joint_offsets(draws: Draws) -> dict[str, Draws]:
-    """Return arm → error of its six joints, empty where there is none."""
+    """Return arm → error of its six joints, empty if there is none."""
     values = draws[_PLACES["kinematic_error"]]
     if not any(values):
         return {}
@@ -253,13 +253,13 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
             getattr(model, name)[:] = getattr(source, name)
         return
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    # They place the cameras' near and far planes.
+    # Extent and centre set the cameras' near and far planes.
     model.stat.extent = source.stat.extent
     model.stat.center[:] = source.stat.center
 
 
 def _place_phantom(scene: Scene, model: mujoco.MjModel, where: Placement) -> None:
-    """Move the phantom and the tray it stands in, and what lies about; ink the pair to sew."""
+    """Move the phantom, the tray it stands in and the distractors; ink the pair to sew."""
     source = scene.model
     poses = dict.fromkeys(STAND, where.T_world_phantom) | {distractors.BODY: where.T_world_bed}
     for name, pose in poses.items():
@@ -275,7 +275,7 @@ def _stands(name: str) -> bool:
 
 
 def _light(model: mujoco.MjModel, factors: Array) -> None:
-    """Scale an appearance's head light, with the endoscope's own, and its two lamps."""
+    """Scale an appearance's headlight, together with the endoscope's own, and its two lamps."""
     lamps = np.append(factors[1:], factors[0])[:, None]
     for kind in ("ambient", "diffuse", "specular"):
         getattr(model.vis.headlight, kind)[:] *= factors[0]
@@ -300,9 +300,9 @@ def _aim(
 ) -> None:
     """Shift a rig of cameras [m], turn it [rad] and widen its view [deg].
 
-    It turns about its first camera, in the axes of what carries it.
+    It turns about its first camera, in the axes of the body that carries it.
 
-    Where a rig's first camera sees so much more, the others see more by the same factor.
+    The views of its other cameras widen by the same factor as the first one's.
     """
     first = source.camera(cameras[0]).id
     rotation = rotvec_to_matrix(turn)

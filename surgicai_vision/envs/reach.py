@@ -1,6 +1,6 @@
-"""Reach: whether an arm's joints can follow the needle's way through the tissue.
+"""Reach: whether an arm's joints can follow the needle's path through the tissue.
 
-A way is a list of T_world_tip (4, 4) of the arm that holds the needle by a grasp T_needle_tip.
+A *way* is a list of T_world_tip (4, 4) of the arm that holds the needle by a grasp T_needle_tip.
 """
 
 import math
@@ -18,25 +18,25 @@ from surgicai_vision.scene.kinematics import Joints
 Matrix = NDArray[np.float64]
 
 PLACES = 9
-"""Places along the circle at which the joints are found."""
+"""Points along the circle at which the joints are computed."""
 OUT = math.radians(12.0)
 """How far past the exit the pull-out turns the needle's base [rad]."""
 ROOM = math.radians(5.0)
-"""What a way must leave of a turning joint's range [rad]: closing jaws may turn a needle by 4°
-(`envs.handoff.STRAIGHT`)."""
+"""Margin that a way must keep to a rotary joint's limits [rad]: closing jaws may turn a needle
+by 4° (`envs.handoff.STRAIGHT`)."""
 TURNING = [index for index in range(len(kinematics.DVRK_JOINTS)) if index != kinematics.INSERTION]
-"""The joints that turn."""
+"""Indices of the rotary joints."""
 
 
 def insertion(stitch: Stitch, grasp: Matrix) -> list[Matrix]:
-    """Return the way of PSM2 from the entry to the end of the insertion, by T_needle_tip."""
+    """Return PSM2's way from the entry to the end of the insertion, for a grasp T_needle_tip."""
     last = stitch.angle_at_entry(stitch.insert_angle, INSERT_DEPTH + EXTRA)
     circle = [stitch.on_arc(at) @ grasp for at in np.linspace(stitch.tip_angle, last, PLACES)]
     return [stitch.place() @ grasp, *circle]
 
 
 def extraction(stitch: Stitch, grasp: Matrix) -> list[Matrix]:
-    """Return the way of PSM1 from there to the end of the pull-out, by T_needle_tip."""
+    """Return PSM1's way from the insertion's to the pull-out's end, for a grasp T_needle_tip."""
     first = stitch.angle_at_entry(stitch.insert_angle, INSERT_DEPTH + EXTRA)
     last = -2 * stitch.half - OUT
     circle = [stitch.on_arc(at) @ grasp for at in np.linspace(first, last, PLACES)]
@@ -44,7 +44,7 @@ def extraction(stitch: Stitch, grasp: Matrix) -> list[Matrix]:
 
 
 def joints_along(arm: str, way: Sequence[Matrix], instrument: str) -> list[Joints]:
-    """Return an arm's joints along a way, each found from the one before.
+    """Return an arm's joints along a way, each solved from the previous ones.
 
     Raises:
         UnreachablePose: past a joint limit.
@@ -58,7 +58,7 @@ def joints_along(arm: str, way: Sequence[Matrix], instrument: str) -> list[Joint
 
 
 def is_followed(arm: str, way: Sequence[Matrix], instrument: str) -> bool:
-    """Return True if no joint limit of the arm is in the way, nor as near to it as `ROOM`."""
+    """Return True if an arm's joints keep within their limits on a way, rotary ones by `ROOM`."""
     try:
         joints = joints_along(arm, way, instrument)
     except UnreachablePose:

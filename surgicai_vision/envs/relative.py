@@ -1,25 +1,26 @@
-"""Relative features: what obs_type "goal" shows, as a network learns from it (obs_type "relative").
+"""Relative features: obs_type "goal" in a form suited to learning (obs_type "relative").
 
-The goal dict has metres beside radians, and its rotation vectors lie near a length of π in a grasp,
+The goal dict mixes metres and radians, and in a grasp the length of its rotation vectors is near π,
 where they flip sign between neighbouring steps. Here the error is relative and in the active arm's
-base frame, in which actions are. The features are functions of the goal dict alone, so that
-hindsight relabelling keeps working: relabel the goal, then compute them.
+base frame, like actions. The features are functions of the goal dict alone, so that hindsight
+relabelling keeps working: relabel the goal, then compute them.
 
 `relative_features(observation, achieved_goal, desired_goal, base)` → (24,) or (batch, 24) float32,
 in the order of `names.RELATIVE_NAMES`:
 
 * 0–2: the tip in the base [cm].
 * 3–8: the x and the y axis of the tip's frame in the base. Sines and cosines of roll, pitch and yaw
-  would jump where the pitch is 90°, which an arm can reach (89.3° in an insertion with one angle
-  driven to its end); two columns of the rotation matrix do not (Zhou et al., On the continuity of
-  rotation representations, CVPR 2019).
+  would jump at a pitch of 90°, which an arm can reach (89.3° in an insertion with one angle driven
+  to its end); two columns of the rotation matrix do not (Zhou et al., On the continuity of rotation
+  representations, CVPR 2019).
 * 9: the jaw [rad].
-* 10–12: the way from the achieved to the desired place in the base [cm].
+* 10–12: the way from the achieved to the desired position in the base [cm].
 * 13–15: the turn from the achieved to the desired rotation in the base: the rotation vector [rad],
-  which fades to 0 from `FADE` on to half a turn, where its sign is not defined.
-* 16–18: tanh of the way / `FINE_DISTANCE`, 19–21: tanh of the turn / `FINE_TURN`: what tolerances
-  of millimetres need.
-* 22, 23: whether what success needs besides the pose holds, and whether the goal asks for it.
+  which fades to 0 between `FADE` and half a turn, where its sign is not defined.
+* 16–18: tanh of the way / `FINE_DISTANCE`, 19–21: tanh of the turn / `FINE_TURN`: the resolution
+  that tolerances of millimetres need.
+* 22, 23: whether the success conditions other than the pose hold, and whether the goal requires
+  them.
 
 No element jumps between neighbouring poses (`tests/envs/test_relative.py`).
 """
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 FADE = np.deg2rad(150.0)
 """Where the rotation vector begins to fade [rad]; no subtask starts further from its goal."""
 FINE_DISTANCE = 0.002
-"""Way whose fine feature is tanh 1 [m]: about the tolerance of a grasp."""
+"""Distance whose fine feature is tanh 1 [m]: about the tolerance of a grasp."""
 FINE_TURN = 0.2
 """Turn whose fine feature is tanh 1 [rad]: about the tolerances, 10° to 20°."""
 

@@ -1,8 +1,8 @@
 """Ridge: where the phantom's tissue is, and where a needle's arc meets it, in plain floats.
 
-All in the phantom's frame, in which the layouts are given; the phantom may be shifted and turned
-about z. Flanks are numbered: 2 × piece is that of the entry, 2 × piece + 1 that of the exit. The
-crest is taken as sharp: the two flanks go on until they meet.
+Everything is in the phantom's frame, in which the layouts are given; the phantom may be shifted and
+turned about z. Flanks are numbered: 2 × piece is that of the entry, 2 × piece + 1 that of the exit.
+The crest is treated as sharp: the two flanks continue until they meet.
 """
 
 import math
@@ -13,9 +13,9 @@ from surgicai_vision.scene import needle, phantom
 from surgicai_vision.scene.holes import PAIRS, SURFACE, Point
 
 STEP = 0.0005
-"""Of the search along an arc that was put into the tissue [m]."""
+"""Step of the search along an arc that was put into the tissue [m]."""
 EMBEDDED = 0.0005
-"""Depth of the tip [m] from which a needle that was put somewhere is inside the tissue."""
+"""Depth of the tip [m] from which a needle that was put in place counts as inside the tissue."""
 BEHIND = math.radians(60.0)
 """How far the arc is continued beyond the needle's base to find where it went in [rad]."""
 
@@ -39,7 +39,7 @@ class Ridge:
         self.top = max(
             pair.entry.centre[2] + pair.gap / 2 * math.tan(abs(pair.entry.tilt)) for pair in pairs
         )
-        """A height [m] above all of it."""
+        """A height [m] above the whole ridge."""
         self.put((0.0, 0.0, 0.0), 0.0)
 
     def put(self, place: Point, turn: float) -> None:
@@ -73,7 +73,7 @@ class Ridge:
         return -1 if y > edges[0] or y < edges[-1] else self.nearest_piece(point)
 
     def nearest_piece(self, point: Point) -> int:
-        """Return the index of the piece at a point's y, beyond an end that of the last there."""
+        """Return the index of the piece at a point's y; beyond an end, that of the last piece."""
         y = point[1]
         edges = self._edges
         piece = 0
@@ -101,7 +101,7 @@ class Ridge:
         return point[2] > SURFACE and self.piece(point) >= 0 and self.height(point) < 0.0
 
     def flank_above(self, point: Point) -> int:
-        """Return the flank that a point is outside of, `NO_FLANK` where it left another way."""
+        """Return the flank that a point is outside of, `NO_FLANK` if it left elsewhere."""
         piece = self.piece(point)
         if piece < 0 or point[2] < SURFACE:
             return NO_FLANK
@@ -116,7 +116,7 @@ class NeedleArc:
     """The needle's arc in the phantom's frame.
 
     Args:
-        ridge: what it is in.
+        ridge: gives the phantom's frame and surface.
     """
 
     def __init__(self, ridge: Ridge):
@@ -128,7 +128,7 @@ class NeedleArc:
         self._v: Point = (0.0, 1.0, 0.0)
 
     def read(self, pose: Sequence[float]) -> None:
-        """Take the needle's position [m] and quaternion (w, x, y, z) in world."""
+        """Set the arc from the needle's position [m] and quaternion (w, x, y, z) in world."""
         x, y, z, w, i, j, k = pose
         direction = self._ridge.direction
         self._centre = self._ridge.to_phantom((x, y, z))
@@ -180,7 +180,7 @@ class NeedleArc:
         """Return the angle [rad], nearest to `near`, at which the arc crosses a flank's plane.
 
         Along the arc the height over the plane is a + reach sin(θ - φ); it rises through 0 at one
-        angle and falls through it at one. None where the circle does not meet the plane.
+        angle and falls through it at another. None if the circle does not meet the plane.
         """
         nx, nz = self._ridge.normal(flank)
         u = self._u
@@ -197,12 +197,12 @@ class NeedleArc:
         return near + math.remainder(angle - near, 2.0 * math.pi)
 
     def embedded(self) -> tuple[int, int, float, float] | None:
-        """Return where the arc lies in the tissue, or None where it does not.
+        """Return where the arc lies in the tissue, or None if it does not.
 
         Returns:
-            Entry flank, exit flank (`NO_FLANK` where the tip is inside), and the angles [rad] of
-            both ends of the embedded part: of the passage nearest to the tip. A needle whose base
-            is inside has its entry beyond its base.
+            Entry flank, exit flank (`NO_FLANK` if the tip is inside), and the angles [rad] of both
+            ends of the embedded part, for the passage nearest to the tip. If the needle's base is
+            inside, the entry lies beyond the base.
         """
         ridge = self._ridge
         step = STEP / self.radius

@@ -1,15 +1,15 @@
 """Simulation: one scene in motion, with commands, measured poses, contacts and the whole state.
 
-* `Simulation(scene)` owns a MjData.
+* `Simulation(scene)` owns an MjData.
 * `advance(arm, action, step)`: one control step; False when the physics diverged.
 * `tip(arm)`, `grasp(arm)`, `needle()`: measured poses in world (`scene.kinematics.Pose`).
 * `touching(arm)`: whether the left and the right jaw pad touch the needle.
-* `get_state()`, `set_state(vector)`: everything: MuJoCo's integration state and the task state.
+* `get_state()`, `set_state(vector)`: all state: MuJoCo's integration state and the task state.
 
-A control step is ten physics steps of 2 ms, cut so that it *ends* with MuJoCo's position and
+A control step is ten physics steps of 2 ms, arranged so that it *ends* with MuJoCo's position and
 velocity stages (`mj_step1`): measured poses, contacts and images belong to the state they are read
-with, and a restored state gives the same ones, bit for bit. MuJoCo resets itself on divergence; the
-clock shows it.
+with, and a restored state gives the same ones, bit for bit. MuJoCo resets itself on divergence,
+which the clock reveals.
 """
 
 import copy
@@ -39,24 +39,25 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
 SUBSTEPS = 10
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 CLOCK_START = 1.0
-"""Time at the start of an episode [s]: not 0, so that MuJoCo's own reset to 0 shows at once."""
+"""Time at the start of an episode [s]: not 0, so that MuJoCo's own reset to 0 is noticed."""
 _SET_SEVEN = struct.Struct("7d").pack_into
 _THREE = struct.Struct("3d").unpack_from
 _NINE = struct.Struct("9d").unpack_from
-"""One row of positions, of rotations, as floats: half the time of `array[row].tolist()`."""
+"""One row of positions or rotations as floats, in half the time of `array[row].tolist()`."""
 RELEASE_STEPS = 40
-"""Control steps in which PSM2 lets go after the handoff."""
+"""Control steps during which PSM2 lets go after the handoff."""
 RELEASE_JAW = 0.1
-"""How far its jaw opens a step [rad], to 0.5 rad."""
+"""How far its jaw opens per step [rad], up to 0.5 rad."""
 RELEASE_SHIFT = 0.001
-"""How far it is then drawn back a step [m]."""
+"""How far it is then drawn back per step [m]."""
 DROPPED = 0.005
-"""How far the needle's arc is from the jaws of an arm that dropped it, at least [m]."""
+"""Smallest distance of the needle's arc from the jaws of an arm that has dropped it [m]."""
 ARC_PARTS = 12
 """Parts of the arc at whose ends that distance is measured: 1.8 mm each."""
 BESIDE = 0.0115
-"""How far beside the exit PSM1 starts at least [m]; its home is 27 mm beside that of pair 1. A
-start that the draws of robot and phantom would put nearer, in PSM2's way, is moved out."""
+"""Smallest sideways distance from the exit at which PSM1 starts [m]; its home is 27 mm to the side
+of pair 1's exit. A start that the draws of robot and phantom would put nearer, in PSM2's way, is
+moved outwards."""
 
 
 _COMMANDS = TaskState.SIZE
@@ -64,8 +65,8 @@ _DRAWS = _COMMANDS + COMMAND_SIZE * len(names.ARMS)
 _WELDS = _DRAWS + randomisation.SIZE
 _QUEUE = _WELDS + attach.SIZE
 USED = _QUEUE + 7 * LATENCY_LIMIT
-"""What the user data hold, in this order: task state, commands, an episode's randomisation, welds,
-waiting actions; soft tissue follows (`tissue.SIZE`)."""
+"""User data in use, in this order: task state, commands, an episode's randomisation, welds, waiting
+actions; soft tissue follows (`tissue.SIZE`)."""
 
 
 class Simulation:
@@ -73,9 +74,9 @@ class Simulation:
 
     Args:
         scene: the compiled scene.
-        own_model: keep a copy of its model, to be randomised; scenes of grasp level "attach" always
-            have one.
-        latency: control steps an action waits.
+        own_model: keep a copy of its model, to be randomised; scenes of grasp level "attach" or
+            with soft tissue always have one.
+        latency: control steps by which an action is delayed.
     """
 
     def __init__(self, scene: Scene, *, own_model: bool = False, latency: int = 0):
@@ -131,7 +132,7 @@ class Simulation:
         self.refresh()
 
     def _start(self, arm: str) -> NDArray[np.float64]:
-        """Return T_base_tip (4, 4) of an arm at the start; PSM1 leaves the stitch to PSM2."""
+        """Return T_base_tip (4, 4) of an arm at the start; PSM1 keeps clear of PSM2's stitch."""
         start = kinematics.start_in_base(arm)
         base = kinematics.base_in_world(arm)
         shift = randomisation.start_shift(self.draws, arm)
@@ -161,7 +162,7 @@ class Simulation:
             self.tissue.meet(self.radius, self.tip_angle)
 
     def _meet_draws(self) -> None:
-        """Take the needle's shape, the phantom's place and the pair from the draws."""
+        """Read the needle's shape, the phantom's placement and the pair from the draws."""
         self.shape = randomisation.needle_shape(self.draws)
         self.radius = self.shape.radius
         self.tip_angle = self.shape.tip_angle
@@ -210,7 +211,7 @@ class Simulation:
         _SET_SEVEN(self._ctrl, self._servos[arm], *joints, control.jaw_servo(command.jaw))
 
     def pose_needle(self, pose: Pose) -> None:
-        """Put the needle at a pose in world, at rest; where that is in soft tissue, embedded."""
+        """Put the needle at a pose in world, at rest; embedded if that is in soft tissue."""
         free = self.scene.needle_qpos.start
         self.data.qpos[free : free + 3] = poses.position(pose)
         turn = matrix_to_quaternion_flat(poses.rotation(pose))
@@ -238,8 +239,8 @@ class Simulation:
     def advance(self, arm: str, action: list[float], step: StepSize) -> bool:
         """Take one control step of 20 ms; return False on a physics error.
 
-        That is: MuJoCo diverged and reset itself, or somebody wrote a command that is not finite
-        into `data.ctrl`, in whose place MuJoCo would take zeros for all servos.
+        A physics error means that MuJoCo diverged and reset itself, or that a non-finite command
+        was written into `data.ctrl`: MuJoCo would replace it by zeros for all servos.
 
         Args:
             arm: the arm the action moves.
@@ -260,12 +261,12 @@ class Simulation:
     ) -> bool:
         """Take one control step under commands of any arms, as a robot's interface gives them.
 
-        Nothing is done by itself: no action waits, and PSM2 lets go only where it is told to.
+        Nothing happens automatically: actions are not delayed, and PSM2 lets go only if commanded.
 
         Args:
             commands: arm → its new command; an arm left out keeps its own.
-            halfway: called after half of the control step, when joints may be read; poses of bodies
-                are those of a physics step before.
+            halfway: called after half of the control step, when joints may be read; body poses are
+                then one physics step old.
 
         Returns:
             As `advance`.
@@ -276,7 +277,7 @@ class Simulation:
         return self._run(halfway) and finite
 
     def _have_finite_servos(self) -> bool:
-        """Return whether all servos' set points are finite; else give them their commands again."""
+        """Return whether all servos' set points are finite; if not, restore their commands."""
         ctrl = self._ctrl
         finite = isfinite(ctrl.dot(ctrl))
         if not finite:
@@ -304,10 +305,10 @@ class Simulation:
         return bool(abs(data.time - due) < 1e-9)
 
     def within_reach(self, arm: str) -> Command:
-        """Return an arm's command, drawn back to where its servos can still tell the difference.
+        """Return an arm's command, drawn back to the range in which its servos still respond.
 
         A servo at its torque limit does not follow; without this the command of an arm that presses
-        on something would run away from it, and the way back would begin with as many lost steps.
+        on something would run away from it, and the way back would lose as many steps.
         """
         command = self.commands[arm]
         measured = self._qpos[self.scene.arms[arm].qpos].tolist()
@@ -324,13 +325,13 @@ class Simulation:
         return Command(kinematics.forward_flat(joints, self._instrument), command.jaw, joints)
 
     def _delayed(self, action: list[float]) -> list[float]:
-        """Queue an action and return the one whose time has come."""
+        """Queue an action and return the one that is due."""
         waiting = self.data.userdata[_QUEUE : _QUEUE + 7 * self.latency].tolist()
         self.data.userdata[_QUEUE : _QUEUE + 7 * self.latency] = waiting[7:] + action
         return list(waiting[:7])
 
     def drop_waiting(self) -> None:
-        """Forget the actions that wait: another arm is active now."""
+        """Discard the waiting actions, because another arm is active now."""
         self.data.userdata[_QUEUE:USED] = 0.0
 
     def pending(self, arm: str, step: StepSize) -> Command:
@@ -344,7 +345,7 @@ class Simulation:
         return command
 
     def _attach(self, welds: Welds) -> None:
-        """Attach the needle to closed jaws that touch it, let it go from open ones."""
+        """Attach the needle to closed jaws that touch it, release it from open ones."""
         changed = False
         for arm in names.ARMS:
             closed = self.commands[arm].jaw < attach.CLOSED
@@ -403,7 +404,7 @@ class Simulation:
         return read["needle"] if read is not None and "needle" in read else self._body("needle")
 
     def tip_in_base(self, arm: str) -> Pose:
-        """Return T_base_tip as the arm reports it, which does not know of its joints' error."""
+        """Return T_base_tip as the arm reports it, without knowing its joints' error."""
         if not self.offsets:
             return self.to_base(arm, self.tip(arm))
         return kinematics.forward_flat(self.reported_joints(arm), self.scene.config.instrument)
@@ -481,7 +482,7 @@ class Simulation:
     def touches_phantom(self, *, needle: bool) -> bool:
         """Return True if an instrument, or with `needle` the needle too, touches the phantom.
 
-        The thread always may. A needle in soft tissue touches it.
+        The thread is ignored. A needle in soft tissue counts as touching it.
         """
         if needle and self.tissue and self.tissue.stage:
             return True
@@ -515,8 +516,8 @@ class Simulation:
         """Return a vector of `get_state` with the numbers of some axes of randomisation replaced.
 
         Args:
-            state: of this scene.
-            given: axis → its numbers, as `randomisation.report` has them.
+            state: a state of this scene.
+            given: axis → its numbers, as `randomisation.report` returns them.
         """
         mujoco.mj_setState(self.model, self.data, state, STATE)
         draws = tuple(self.data.userdata[_DRAWS:_WELDS].tolist())
@@ -529,8 +530,8 @@ class Simulation:
         """Restore a vector of `get_state`.
 
         Raises:
-            InputError: of another length, not finite, or of a randomised episode where this env has
-                no randomisation.
+            InputError: of another length, not finite, or of a randomised episode although this env
+                has no randomisation.
         """
         vector = np.ascontiguousarray(state, dtype=np.float64)
         size = mujoco.mj_stateSize(self.model, STATE)

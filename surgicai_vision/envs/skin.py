@@ -1,14 +1,14 @@
-"""Skin: what an env's soft tissue shows at its present state.
+"""Skin: how an env's soft tissue looks in its present state.
 
-A function of the state alone: a restored state looks as it did. `Skin.follow` reads
+It is a function of the state alone, so a restored state looks as it did. `Skin.follow` reads
 
-* what presses: the needle's tip and the shaft behind it before they pierce, the jaws' pads on the
-  flat tissue, which may dent it by `phantom.DENT`;
+* what presses: the needle's tip and the shaft behind it before they pierce, and the jaws' pads on
+  the flat tissue, which may dent it by `phantom.DENT`;
 * a tip that lifts the skin from inside before it comes out;
-* the places that hold the needle, which the skin follows;
+* the places where the skin holds the needle and follows it;
 * the wounds of all bites: round where the needle went through, and as long as the tissue tore.
 
-Lengths are rounded (`PLACE`, `WAY`), so that the meshes are written anew only when it can be seen.
+Lengths are rounded (`PLACE`, `WAY`), so that the meshes are rewritten only for visible changes.
 """
 
 import math
@@ -30,7 +30,7 @@ PLACE = 3e-4
 WAY = 1.2e-4
 """Displacements are rounded to this [m]."""
 TIP_REACH = 0.0012
-"""Reach of the dent about a needle [m]: about as deep as wide, as skin under a point."""
+"""Reach of the dent about a needle [m]: about as deep as wide, like skin under a point."""
 LIFT_REACH = 0.0009
 """Reach of the skin that a tip lifts from inside [m]."""
 HOLD_REACH = 0.0015
@@ -38,13 +38,13 @@ HOLD_REACH = 0.0015
 JAW_REACH = 0.0022
 """Reach of the dent about a corner of a jaw's pad [m]: half a pad is 1.5 mm wide."""
 SHAFT = (0.0, 0.08, 0.16, 0.24, 0.4, 0.6, 0.8)
-"""Places of the needle that can press, from the tip, in shares of its arc."""
+"""Points of the needle that can press, measured from the tip in shares of its arc."""
 AHEAD = 0.0003
-"""How far ahead of a tip that comes from inside the skin begins to rise [m]."""
+"""How far ahead of a tip coming from inside the skin begins to rise [m]."""
 PRESSING = 6
-"""Dents at most that are drawn at once, the deepest."""
+"""Most dents that are drawn at once, the deepest ones."""
 CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 0.0, 1.0)])
-"""Points of a jaw's pad, in halves of its sides."""
+"""Points of a jaw's pad, in units of half its sides."""
 
 
 class Skin:
@@ -115,7 +115,7 @@ class Skin:
         return pulls
 
     def _jaw_dents(self) -> list[Pull]:
-        """Return where the jaws press on the tissue: the deepest point of each pad."""
+        """Return where the jaws press on the tissue: the deepest points of each pad."""
         simulation = self._simulation
         pulls = []
         for pad in self._pads:
@@ -159,14 +159,14 @@ def _is_over(point: Point) -> bool:
 
 
 def _along(point: Point, height: float, normal: Point, way: float, reach: float) -> Pull:
-    """Return the pull of the skin below or above a point by `way` along its normal."""
+    """Return the pull that moves the skin below or above a point by `way` along its normal."""
     x, y, z = (p - height * n for p, n in zip(point, normal, strict=True))
     u, v, w = (way * n for n in normal)
     return Pull((x, y, z), (u, v, w), reach)
 
 
 def _wounds_of(passage: Passage) -> list[Wound]:
-    """Return the wounds of a bite: as long as the skin gave way where it tore."""
+    """Return the wounds of a bite; where the skin tore, they are as long as it gave way."""
     is_torn = passage.tears > 0
     wounds = [Wound(passage.entry if is_torn else passage.entry_now, passage.entry_now)]
     if passage.is_out:

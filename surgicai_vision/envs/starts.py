@@ -1,7 +1,7 @@
 """Starts: put the needle into an arm's jaws by solving for the pose.
 
 The jaws are posed closed around the needle and the physics settles for `SETTLE` steps; a start that
-then is not a grasp, or that touches the phantom where it should not, is refused and drawn again.
+is then not a grasp, or that touches the phantom where it should not, is refused and drawn again.
 """
 
 import math
@@ -21,9 +21,9 @@ from surgicai_vision.scene.rotations import rotvec_to_matrix
 Matrix = NDArray[np.float64]
 
 SETTLE = 60
-"""Physics steps (2 ms) a start state settles."""
+"""Physics steps (2 ms) for which a start state settles."""
 REST_SPEED = 0.010
-"""A held needle faster than this [m/s] is slipping out, as after one closing of the jaws in 150."""
+"""A held needle faster than this [m/s] is slipping out, as in one of 150 closings of the jaws."""
 REST_TURN = 1.0
 """The same for its rotation [rad/s]."""
 PUSHED = 0.0005
@@ -37,7 +37,7 @@ SAFE_ANGLES = (FIRST_GRASP, math.radians(27.0))
 
 
 class GraspError(NamedTuple):
-    """How far a grasp is off the nominal one."""
+    """How far a grasp is from the nominal one."""
 
     along: float
     """Along the needle [m]."""
@@ -50,8 +50,8 @@ class GraspError(NamedTuple):
 def draw_grasp_error(rng: np.random.Generator, shift: float, angle: float) -> GraspError:
     """Draw how far a grasp is off: at most `shift` [m] and `angle` [rad].
 
-    The shift is along the needle and in depth, the angle about two axes. The jaws' flat pads take
-    the third translation and the third rotation away when they close.
+    The shift is along the needle and in depth, the angle about two axes. The jaws' flat pads remove
+    the third translation and the third rotation when they close.
     """
     along = rng.uniform(-shift, shift)
     depth = rng.uniform(-0.6, 0.2) * math.sqrt(shift**2 - along**2)
@@ -109,9 +109,9 @@ def hold_needle(
 
 
 def stands_free(simulation: Simulation, arm: str) -> bool:
-    """Return True if an arm stands where it was put: nothing has pushed it out of itself.
+    """Return True if an arm is still where it was put: nothing has pushed it away.
 
-    One that was put into the tissue is off by some millimetres once it has settled, touches
+    An arm that was put into the tissue is off by some millimetres once it has settled, touches
     nothing, and strikes the tissue when it comes back.
     """
     wanted = simulation.true_pose(arm, simulation.commands[arm])
@@ -119,7 +119,7 @@ def stands_free(simulation: Simulation, arm: str) -> bool:
 
 
 def _at_rest(simulation: Simulation) -> bool:
-    """Return True if the needle has stopped: it does not slip out of the jaws."""
+    """Return True if the needle is at rest, that is, not slipping out of the jaws."""
     first = simulation.model.joint("needle").dofadr[0]
     velocity = simulation.data.qvel[first : first + 6]
     return bool(

@@ -1,10 +1,10 @@
-"""Subtask: what one step of the procedure is, or a task of another distribution.
+"""Subtask: one step of the procedure, or a task of another distribution.
 
-One file a subtask; this is what they share.
+Each subtask has its own file; this is what they share.
 
-A subtask says which arm moves, how an episode starts, which measured pose must meet which goal, and
-what else success needs. It keeps no state: everything an episode remembers is in the simulation's
-`TaskState`.
+A subtask defines which arm moves, how an episode starts, which measured pose must meet which goal,
+and what else success requires. It keeps no state: everything an episode remembers is in the
+simulation's `TaskState`.
 """
 
 import math
@@ -21,11 +21,11 @@ from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.scene.kinematics import Pose
 
 NO_PHASE = -1
-"""The phase of a task that is no subtask of the procedure."""
+"""The phase of a task that is not a subtask of the procedure."""
 
 
 class Tolerance(NamedTuple):
-    """How near is near enough: distance [m] and geodesic angle [rad]."""
+    """Largest errors accepted: distance [m] and geodesic angle [rad]."""
 
     distance: float
     angle: float
@@ -36,19 +36,19 @@ class Tolerance(NamedTuple):
         return cls(millimetres / 1e3, math.radians(degrees))
 
     def scaled(self, share: float) -> "Tolerance":
-        """Return so large a share of it."""
+        """Return this share of the tolerance."""
         return Tolerance(share * self.distance, share * self.angle)
 
 
 @dataclass(frozen=True)
 class Demands:
-    """What success needs besides the pose.
+    """What success requires besides the pose.
 
     Attributes:
-        contact: both jaw pads of the active arm touch the needle.
-        holes: 2 where the needle must be in both holes, passed in travel direction; 0 where it does
-            not matter.
-        out: the needle must be wholly out of the tissue, after having passed both holes.
+        contact: both jaw pads of the active arm must touch the needle.
+        holes: 2 if the needle must be in both holes, passed in travel direction; 0 if this does not
+            matter.
+        out: the needle must be completely out of the tissue, after having passed both holes.
     """
 
     contact: bool = False
@@ -57,23 +57,23 @@ class Demands:
 
 
 class Subtask(ABC):
-    """One subtask of the procedure, or a task of its own."""
+    """One subtask of the procedure, or a separate task."""
 
     name: ClassVar[str]
     arm: ClassVar[str]
     """The arm that moves, one of `names.ARMS`."""
     text: ClassVar[str] = ""
-    """The task as a sentence, LeRobot's `task`; ours have theirs in `names.TASK_TEXTS`."""
+    """The task as a sentence, LeRobot's `task`; built-in ones are in `names.TASK_TEXTS`."""
     phase: ClassVar[int] = NO_PHASE
     """Index in `names.SUBTASKS` of a subtask of the procedure."""
     expert: ClassVar[str] = ""
-    """"module:function" of the expert's rule (`demos.expert`); ours have theirs there."""
+    """"module:function" of the expert's rule (`demos.expert`); built-in rules are found there."""
     max_steps: ClassVar[int] = SUBTASK_STEPS
-    """Control steps an episode may take unless it is said."""
+    """Default limit of an episode [control steps]."""
     tolerances: ClassVar[Mapping[str, Tolerance]]
     """Preset ("paper", "released") → tolerance."""
     demands: ClassVar[Mapping[str, Demands]]
-    """Preset → what else success needs."""
+    """Preset → what else success requires."""
 
     starts_held: ClassVar[bool] = False
     """The active jaws hold the needle at the start."""
@@ -86,16 +86,16 @@ class Subtask(ABC):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Put the simulation into a random start state.
 
-        Return False where the draw is not physical: the caller draws again.
+        Return False if the draw is not physical: the caller draws again.
         """
 
     @abstractmethod
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
-        """Return the measured pose that matters and its goal, both in world."""
+        """Return the measured pose that success is judged by and its goal, both in world."""
 
     def targets(self, simulation: Simulation, stitch: Stitch) -> tuple[tuple[Pose, Pose], ...]:
-        """Return the targets of which any will do for what follows, that of the episode first.
+        """Return all targets that suffice for what follows, that of the episode first.
 
-        There are more than one where each episode draws its goal from a range.
+        There is more than one if each episode draws its goal from a range.
         """
         return (self.target(simulation, stitch),)

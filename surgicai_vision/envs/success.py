@@ -1,10 +1,10 @@
 """Success: whether a task is solved, judged from the measured state, never from the command.
 
-* `paper_success`: the paper's own: position and angle within the tolerance, and what the subtask
-  demands besides (contact, both holes passed, needle out).
-* `is_success`: in channels the same. Soft tissue leads no needle, so it asks for more: the tissue
-  has not torn, and, from the insertion on, the latest bite goes in and comes out within `ON_MARK`
-  of its marks.
+* `paper_success`: the paper's own success: position and angle within the tolerance, and the
+  subtask's other demands met (contact, both holes passed, needle out).
+* `is_success`: the same in channels. Soft tissue does not guide the needle, so more is required:
+  the tissue has not torn, and, from the insertion on, the latest bite goes in and comes out within
+  `ON_MARK` of its marks.
 """
 
 import math
@@ -27,7 +27,7 @@ Info = dict[str, Any]
 
 
 class Verdict(NamedTuple):
-    """Whether a subtask is solved: by the paper, and by what soft tissue asks besides."""
+    """Whether a subtask is solved: by the paper, and with what soft tissue requires in addition."""
 
     paper: bool
     full: bool
@@ -63,9 +63,9 @@ def measure(
 
 
 def judge(simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str) -> Verdict:
-    """Return whether a subtask is solved now, whichever one is on, by any of its `targets`.
+    """Return whether a subtask is solved now, by any of its `targets`, whichever one is active.
 
-    Nothing is remembered: who looks changes nothing.
+    Nothing is stored, so calling it has no side effects.
     """
     if simulation.task_state.has_diverged:
         return Verdict(paper=False, full=False)
@@ -85,9 +85,9 @@ def _is_near(subtask: Subtask, preset: str, distance: float, turn: float) -> boo
 
 
 def meets_demands(simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str) -> bool:
-    """Return True if what success needs besides the pose holds: contact, holes, needle out, marks.
+    """Return True if the other conditions of success hold: contact, holes, needle out, marks.
 
-    After a physics error nothing holds.
+    The pose is not checked. After a physics error none of them holds.
     """
     contact = simulation.holds(subtask.arm)
     return (
@@ -100,7 +100,7 @@ def meets_demands(simulation: Simulation, subtask: Subtask, stitch: Stitch, pres
 def _meets_demands(
     simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str, contact: bool
 ) -> bool:
-    """Return True if what the paper asks for besides the pose holds."""
+    """Return True if the paper's conditions other than the pose hold."""
     demands = subtask.demands[preset]
     passed = simulation.task_state.holes_passed
     if demands.contact and not contact:
@@ -115,7 +115,7 @@ def _meets_demands(
 
 
 def _is_well_stitched(simulation: Simulation, subtask: Subtask, stitch: Stitch) -> bool:
-    """Return True in channels, and in soft tissue that is whole and pierced at its marks."""
+    """Return True in channels, and in soft tissue that is intact and pierced at its marks."""
     tissue = simulation.tissue
     if tissue is None:
         return True
@@ -145,8 +145,8 @@ def _slip(simulation: Simulation, arm: str, contact: bool) -> NDArray[np.float64
         state.is_held = True
         state.hold = poses.relative(grasp, lying)
         return np.zeros(2)
-    # The point then grasped lies at `inverse_origin(hold)` in the needle's frame; a rotation does
-    # not change the length of its way.
+    # The point that was grasped lies at `inverse_origin(hold)` in the needle's frame; a rotation
+    # does not change the length of its displacement.
     shift = poses.gap(lying, poses.inverse_origin(state.hold), grasp)
     held = multiply_flat(poses.rotation(grasp), poses.rotation(state.hold))
     return np.array((shift, geodesic_angle_flat(poses.rotation(lying), held)))

@@ -1,18 +1,18 @@
 """Suture: the whole procedure, all five subtasks in one episode.
 
 The present subtask's success must hold for `DWELL` control steps before the next one begins: the
-paper's tolerances are met before a subtask is finished (an insertion counts 5 mm before its goal),
-and the next one needs it finished. When the pull-out begins PSM2 lets go by itself, as in the
-released code. A high-level policy may choose another subtask by `enter`.
+paper's tolerances are met before a subtask is finished (an insertion succeeds 5 mm before its
+goal), but the next one needs it finished. When the pull-out begins, PSM2 lets go automatically, as
+in the released code. A high-level policy may choose another subtask with `enter`.
 
-With `TaskConfig.advance` "told" only `enter` goes on to a subtask: what is measured moves no arm
-and lets nothing go. It is still counted, wherever the procedure has been told to be: a subtask that
-is solved after all before it (any grasp within the range that goals are drawn from will do), an
-insertion and a pull-out also by themselves, since no needle is in both holes that was not brought
-there. The whole is solved when the pull-out is.
+With `TaskConfig.advance` "told" only `enter` switches to a subtask: measurements move no arm and
+release nothing. Progress is still measured, whichever subtask is active. A subtask counts if it is
+solved after all those before it (any grasp within the range that goals are drawn from will do). An
+insertion and a pull-out also count by themselves, since a needle in both holes must have been
+brought there. The whole procedure is solved when the pull-out is.
 
-In soft tissue the next subtask begins by the paper's own success: a bite beside the marks is still
-pulled out. `subtask_success`, `progress` and `is_success` ask for the marks as well
+In soft tissue the paper's own success suffices to begin the next subtask: a bite off the marks is
+still pulled out. `subtask_success`, `progress` and `is_success` require the marks as well
 (`envs.success`).
 """
 
@@ -30,7 +30,7 @@ class Suture(SuturingEnv):
     """All five subtasks in a row; `is_success` is the whole procedure's."""
 
     def _progress(self, info: Info) -> bool:
-        """Go on to the next subtask when the present one's success has held; return if so."""
+        """Advance to the next subtask once the present one's success has held; return if it did."""
         if self.config.advance == "told":
             self._count(info)
             return False
@@ -49,7 +49,7 @@ class Suture(SuturingEnv):
         return True
 
     def _count(self, info: Info) -> None:
-        """Count the subtasks that are solved, wherever the procedure has been told to be."""
+        """Count the subtasks that are solved, whichever one is active."""
         state = self.simulation.task_state
         info["subtask_success"] = info["is_success"]
         whole = self.judge(PULLOUT_PHASE)
@@ -64,7 +64,7 @@ class Suture(SuturingEnv):
         info["paper_success"] = whole.paper
 
     def judge(self, phase: int) -> Verdict:
-        """Return whether a subtask is solved now, whichever one is on (`envs.success.judge`).
+        """Return whether a subtask is solved now, whichever one is active (`envs.success.judge`).
 
         Args:
             phase: index in `names.SUBTASKS`.
@@ -73,19 +73,19 @@ class Suture(SuturingEnv):
         return judge(self.simulation, subtask, self.stitch, self.config.tolerance)
 
     def _meets_demands(self) -> bool:
-        """Return True only in the last subtask, whose success is that of the whole."""
+        """Return True only in the last subtask, whose success is that of the whole procedure."""
         return self.phase == len(self._subtasks) - 1 and super()._meets_demands()
 
     @property
     def dwell(self) -> int:
-        """Return the control steps for which the present subtask's success has held."""
+        """Return for how many control steps the present subtask's success has held."""
         return self.simulation.task_state.dwell
 
     def enter(self, phase: int) -> None:
         """Make a subtask the present one, as a high-level policy does: its arm moves from now on.
 
         Args:
-            phase: index in `names.SUBTASKS`; that of the present subtask changes nothing.
+            phase: index in `names.SUBTASKS`; the present subtask's index changes nothing.
         """
         if not 0 <= phase < len(self._subtasks):
             raise InputError(

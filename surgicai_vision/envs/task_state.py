@@ -26,9 +26,9 @@ class TaskState:
         holes_passed: hole planes that the needle's tip passed in travel direction, 0 to 2;
             `hole_crossing.OUT` when the base has left the exit as well.
         grasp_angle: needle angle of this episode's grasp goal [rad].
-        is_held: the active jaws hold the needle, first as in `hold`.
+        is_held: the active jaws hold the needle; `hold` is how they first held it.
         dwell: control steps for which the present subtask's success has held (whole procedure).
-        release_steps: control steps for which PSM2 goes on letting go.
+        release_steps: control steps for which PSM2 will continue to let go.
         has_diverged: a physics error happened.
         needle_tip: the needle's tip after the last control step, in world [m].
         tool_tip: the active tool's tip after the last control step, in world [m].
@@ -51,7 +51,7 @@ class TaskState:
     done: int = 0
 
     SIZE: ClassVar[int] = 10 + 2 * len(ORIGIN) + len(IDENTITY)
-    """Numbers of a packed state; `simulation` says what follows it in MuJoCo's user data."""
+    """Number of values in a packed state; `simulation` says what follows it in the user data."""
 
     def pack(self) -> list[float]:
         """Return the state as `SIZE` numbers."""

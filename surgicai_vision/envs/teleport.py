@@ -1,8 +1,8 @@
 """Teleport: put an env into a given state, to replay motions that were recorded elsewhere.
 
-A replay is kinematic: tools and needle stand where the recording had them, at rest, and commands
-match. Images, observations and measurements are those of that state; nothing is claimed about the
-forces between.
+A replay is kinematic: tools and needle are placed where the recording had them, at rest, and
+commands match. Images, observations and measurements are those of that state; nothing is claimed
+about the forces between.
 """
 
 import numpy as np
@@ -30,8 +30,8 @@ def pose_scene(
     Args:
         env: the env; its task state (progress) stays as it is.
         psm1: T_base_tip (4, 4) and jaw [rad] of PSM1; None leaves it where it is.
-        psm2: the same of PSM2.
-        T_world_needle: pose of the needle in world (4, 4); None leaves it.
+        psm2: the same for PSM2.
+        T_world_needle: pose of the needle in world (4, 4); None leaves it where it is.
 
     Raises:
         UnreachablePose: a tip pose outside the joint limits.

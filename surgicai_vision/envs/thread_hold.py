@@ -1,12 +1,12 @@
 """Thread hold: soft tissue holds the thread where it goes in and where it comes out.
 
 Each of the scene's `THREAD_HOLDS` equalities ties a point of one capsule of the thread to a slider.
-Across the thread that is a spring. Along it the slider glides with the thread, by friction, through
-an anchor in the tissue; the sliders of a bite's entry and exit glide the same way. Once a control
-step the slider is put back into its anchor, and the held point as far back along the thread; at the
-end of a capsule the next one takes over at the same place. So the thread goes through, and nothing
-jumps. What is tied to what is in the model, so `write` follows every change and every restored
-state.
+Across the thread this is a spring. Along it the slider glides with the thread, with friction,
+through an anchor in the tissue; the sliders of a bite's entry and exit glide by the same distance.
+Once per control step the slider is put back into its anchor, and the held point moves back along
+the thread by the same distance; at the end of a capsule the next one takes over at the same point.
+So the thread passes through without jumps. The model contains what is tied to what, so `write` must
+follow every change and every restored state.
 """
 
 import math
@@ -22,10 +22,10 @@ from surgicai_vision.scene import tissue as elements
 from surgicai_vision.scene.holes import Point
 
 NOTHING = -1
-"""The segment of a hold that holds none."""
+"""The segment of a hold that holds nothing."""
 NEAREST = 0.001
-"""Nearest to the needle that the thread is held [m]: a hold at the very joint could not turn a
-thread that trails off the wrong way."""
+"""Smallest distance from the needle at which the thread is held [m]: a hold right at the joint
+could not turn a thread that trails off the wrong way."""
 
 
 @dataclass
@@ -33,7 +33,7 @@ class ThreadHold:
     """A place that may hold the thread.
 
     Attributes:
-        segment: the capsule it holds, `NOTHING` where it holds none.
+        segment: the capsule it holds, `NOTHING` if it holds none.
         offset: of the held point from that capsule's start [m].
         anchor: in the phantom's frame [m].
         is_exit: it is a bite's exit; the hold before it is the same bite's entry.
@@ -47,7 +47,7 @@ class ThreadHold:
     friction: float = 0.0
 
     SIZE: ClassVar[int] = 7
-    """Numbers of a packed hold."""
+    """Number of values in a packed hold."""
 
     def pack(self) -> list[float]:
         """Return the hold as `SIZE` numbers."""
@@ -55,7 +55,7 @@ class ThreadHold:
 
     @classmethod
     def unpack(cls, values: Sequence[float]) -> "ThreadHold":
-        """Return the hold of `SIZE` numbers."""
+        """Return the hold packed as `SIZE` numbers."""
         return cls(
             segment=int(values[0]),
             offset=values[1],
@@ -66,17 +66,17 @@ class ThreadHold:
 
 
 class ThreadHolds:
-    """All places that hold the thread of one simulation; none where it has no thread.
+    """All places that hold the thread of one simulation; none if it has no thread.
 
     Args:
         model: the simulation's own copy of its model.
         data: the simulation's.
         ridge: the phantom's frame.
-        segments: capsules of the thread.
+        segments: number of capsules of the thread.
     """
 
     SIZE: ClassVar[int] = elements.THREAD_HOLDS * ThreadHold.SIZE
-    """Numbers of all packed holds."""
+    """Number of values in all packed holds."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, ridge: Ridge, segments: int):
         self._model = model
@@ -95,7 +95,7 @@ class ThreadHolds:
         self._springs: list[elements.Spring] = []
 
     def meet(self) -> None:
-        """Follow a randomised model: the needle's mass, on which the thread's springs depend."""
+        """Adapt to a randomised model: the needle's mass, on which the thread's springs depend."""
         if not self._bodies:
             return
         weights = self._model.body_invweight0[:, 0]
@@ -115,7 +115,7 @@ class ThreadHolds:
         Args:
             anchor: in the phantom's frame [m].
             friction: along the thread [N].
-            is_exit: it is a bite's exit; its entry then holds what lies straight behind it.
+            is_exit: it is a bite's exit; the entry then holds the thread straight behind it.
         """
         if not self._holds:
             return
@@ -128,13 +128,13 @@ class ThreadHolds:
         self.write()
 
     def drop(self) -> None:
-        """Let go of what was taken last."""
+        """Release the newest hold."""
         if self._holds:
             self._shift(ThreadHold(), newest=False)
             self.write()
 
     def _shift(self, hold: ThreadHold, *, newest: bool) -> None:
-        """Add a hold at one end of the list, and take the one at the other end away."""
+        """Add a hold at one end of the list, and remove the one at the other end."""
         slides = [
             (float(self._data.qpos[slide]), float(self._data.qvel[dof]))
             for slide, dof in zip(self._slides, self._dofs, strict=True)
@@ -156,10 +156,10 @@ class ThreadHolds:
             self._data.mocap_quat[self._mocaps[slot]] = turn
 
     def follow(self) -> float | None:
-        """Let the thread go on through the holds.
+        """Let the thread move on through the holds.
 
         Returns:
-            The thread drawn out of the last exit [m]; None where no exit holds it.
+            The length of thread drawn out of the last exit [m]; None if no exit holds it.
         """
         drawn = None
         slides = [float(self._data.qpos[slide]) for slide in self._slides]
@@ -175,7 +175,7 @@ class ThreadHolds:
             if hold.segment >= len(self._bodies):
                 self._holds[slot] = ThreadHold()
             else:
-                # The slider's way is along the capsule.
+                # The slider moves along the capsule.
                 turn = self._data.xquat[self._bodies[hold.segment]]
                 self._data.mocap_quat[self._mocaps[slot]] = turn
             self._data.qpos[self._slides[slot]] = 0.0
@@ -235,7 +235,7 @@ class ThreadHolds:
         return values + [0.0] * (self.SIZE - len(values))
 
     def unpack(self, values: Sequence[float]) -> None:
-        """Take what `pack` returned; MuJoCo's state must be set already."""
+        """Restore what `pack` returned; MuJoCo's state must already be set."""
         size = ThreadHold.SIZE
         self._holds = [
             ThreadHold.unpack(values[slot * size : (slot + 1) * size])

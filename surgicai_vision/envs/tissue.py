@@ -1,6 +1,6 @@
 """Tissue: what happens in soft tissue during an episode; `scene.tissue` has its forces.
 
-`Simulation.tissue` is a `Tissue` where the scene's tissue is "soft", else None. What others read:
+`Simulation.tissue` is a `Tissue` if the scene's tissue is "soft", else None. Others read:
 
 * `bite -> Bite | None`: the needle's present passage, None while it is outside.
 * `bites -> tuple[Bite, ...]`: the passages of this episode, the present one last; `BITES` at most,
@@ -9,29 +9,30 @@
   again), `TRAILING` (the needle's base has gone in).
 * `tears`: how often the tissue tore in this episode.
 * `force_on_needle() -> (3,)`: force of the tissue on the needle in world [N].
-* `thread_drawn`: thread that was drawn out of the last exit that it passed [m].
-* `passed(pair) -> int`: what `TaskState.holes_passed` is.
+* `thread_drawn`: length of thread drawn out of the last exit that it passed [m].
+* `passed(pair) -> int`: the value for `TaskState.holes_passed`.
 * `passages`, `ridge`, `held_at_skin()`: the same in the phantom's frame, to draw the skin.
 
-Once a control step, before positions are computed for it, `update` looks where the needle is:
+Once per control step, before positions are computed for it, `update` checks where the needle is:
 
-* Outside, a tip that dents the skin deeper than its puncture force allows, pointing inwards, goes
-  through: the needle's contact with the ridge ends, and the first hold takes the needle's point in
-  the skin. Its friction grows with the embedded length; a tip that advances also cuts.
-* Inside, the second hold takes the shaft in the middle of the way the tip cut, so that the shaft
-  cannot swing. A tip that lifts the skin from inside goes through at the force for the way out: the
-  second hold takes the needle's point there. Any flank will do, the one of the entry too.
-* When the base goes in, the first hold moves to the middle of the way that is left. When it comes
-  out the bite is done. A needle that is drawn back goes through the same stages in reverse.
-* A hold is an elastic spring up to the yield force; beyond it a part of the displacement stays
+* Outside: a tip that points inwards and dents the skin deeper than its puncture force allows goes
+  through. The needle's contact with the ridge ends, and the first hold takes the point of the
+  needle in the skin. Its friction grows with the embedded length; an advancing tip also cuts.
+* Inside: the second hold takes the shaft in the middle of the path that the tip cut, so that the
+  shaft cannot swing. A tip that lifts the skin from inside goes through at the force for the way
+  out; the second hold then takes the point of the needle there. This can happen on any flank, also
+  on that of the entry.
+* When the base goes in, the first hold moves to the middle of the remaining path. When the base
+  comes out, the bite is done. A needle that is drawn back goes through the same stages in reverse.
+* A hold is an elastic spring up to the yield force; beyond it a part of the displacement remains
   (isotropic hardening). At the tear force the tissue tears: the anchor follows until the yield
-  force is left, and `tears` counts.
+  force is left, and `tears` is incremented.
 * The thread is held where it goes in and where it comes out (`thread_hold`), and slides through
   when the force along it exceeds the friction.
 
 Geometry is in the phantom's frame, in plain floats: the phantom may be shifted and turned about z.
-Everything is packed into MuJoCo's user data, so a state restored in the middle of an insertion goes
-on bit for bit.
+Everything is packed into MuJoCo's user data, so a state restored in the middle of an insertion
+continues bit for bit.
 """
 
 import math
@@ -59,25 +60,25 @@ BITES = 8
 PATH = 100
 """Points of the present passage that are remembered: 50 mm, more than any needle is long."""
 SPACING = 0.0005
-"""Between two points of the way the tip cut [m]."""
+"""Distance between two points of the path that the tip cut [m]."""
 STEEP = 0.5
-"""Cosine of the angle to the inward normal up to which a tip pierces: 60°; flatter it slides."""
+"""Cosine of the largest angle to the inward normal at which a tip pierces (60°); else it slides."""
 OUTWARD = 0.2
-"""Cosine of the angle to the outward normal up to which a tip pierces from inside: 78°."""
+"""Cosine of the largest angle to the outward normal at which a tip pierces from inside: 78°."""
 SEARCH = 0.005
 """How far from the tip along the arc the skin can be where it is pierced [m]."""
 FRONT = 0.0001
-"""A tip that is this near to its furthest way [m] is cutting."""
+"""A tip this near to its furthest advance [m] is cutting."""
 SLIDING = 0.97
-"""Share of the force at which the shaft slides, from which it does."""
+"""Share of the shaft's sliding force from which it counts as sliding."""
 HIGHEST = 0.003
-"""How far the tip lifts the skin at most, however little it is pushed [m]."""
+"""How far the tip can lift the skin at most, however little it is pushed [m]."""
 LEAVING = 0.0002
 """Embedded length [m] below which the needle is out."""
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 SIZE = 7 + NeedleHolds.SIZE + ThreadHolds.SIZE + 1 + BITES * Passage.SIZE + 1 + 3 * PATH
-"""Numbers of a packed state, at most; `Simulation` says where they stand in the user data."""
+"""Largest number of values in a packed state; `Simulation` says where they are in the user data."""
 
 
 class Tissue:
@@ -122,7 +123,7 @@ class Tissue:
         ]
 
     def meet(self, radius: float, tip_angle: float) -> None:
-        """Follow a randomised model: the phantom's place and the needle's size and mass.
+        """Adapt to a randomised model: the phantom's placement and the needle's size and mass.
 
         Args:
             radius: of the needle's arc [m].
@@ -176,7 +177,7 @@ class Tissue:
 
     @property
     def passages(self) -> tuple[Passage, ...]:
-        """Return the bites as they are kept, in the phantom's frame; not to be written."""
+        """Return the bites as they are stored, in the phantom's frame; treat as read-only."""
         return tuple(self._passages)
 
     @property
@@ -187,7 +188,7 @@ class Tissue:
     def held_at_skin(self) -> list[tuple[Point, Point]]:
         """Return where the skin holds the needle, in the phantom's frame [m].
 
-        The place at rest, and where the shaft has dragged it to.
+        Each is a point at rest and where the shaft has dragged it to.
         """
         return [
             (self._holds.anchor(index), self._holds.carried(index)) for index in self._skin_holds
@@ -195,14 +196,14 @@ class Tissue:
 
     @property
     def _skin_holds(self) -> tuple[int, ...]:
-        """Return the holds that are in the skin, not in the middle of the way."""
+        """Return the holds that are in the skin, not in the middle of the path."""
         return {OUTSIDE: (), INSIDE: (0,), THROUGH: (0, 1), TRAILING: (1,)}[self.stage]
 
     def passed(self, pair: HolePair) -> int:
         """Return how many flanks of a stitch the needle passed in the direction of travel.
 
-        0 to 2, and `hole_crossing.OUT` when it has left through the second. How near to the marks
-        is not asked here; a bite through another piece of the ridge counts for another pair.
+        0 to 2, and `hole_crossing.OUT` when it has left through the second. Neither the distance to
+        the marks nor the piece of the ridge is checked here.
         """
         if not self._passages:
             return 0
@@ -218,8 +219,8 @@ class Tissue:
     def force_on_needle(self) -> NDArray[np.float64]:
         """Return the force of the tissue on the needle in world, (3,) [N].
 
-        Of the skin's contacts and of the two holds, computed on data of its own: the simulation
-        goes on as if nobody had asked.
+        It includes the skin's contacts and the two holds. It is computed on separate data, so the
+        simulation is not affected.
         """
         model = self._model
         if self._scratch is None:
@@ -249,7 +250,7 @@ class Tissue:
         return force
 
     def hold_force(self, data: mujoco.MjData) -> NDArray[np.float64]:
-        """Return the force of the two holds on the needle, (3,) [N]; `data` has its forces."""
+        """Return the force of the two holds on the needle, (3,) [N]; `data` needs its forces."""
         rows = data.efc_type[: data.nefc] == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         held = rows & np.isin(data.efc_id[: data.nefc], self._holds.equalities)
         force: NDArray[np.float64] = data.efc_force[: data.nefc][held].reshape(-1, 3).sum(axis=0)
@@ -258,7 +259,7 @@ class Tissue:
     # -- stages ------------------------------------------------------------------------------------
 
     def clear(self) -> None:
-        """Forget everything: the needle is outside of whole tissue."""
+        """Forget everything: the tissue is intact and the needle outside."""
         self.stage = OUTSIDE
         self.tears = 0
         self.thread_drawn = 0.0
@@ -271,7 +272,7 @@ class Tissue:
         self._write()
 
     def update(self) -> None:
-        """Follow the needle and the thread; to be called when positions have just changed."""
+        """Follow the needle and the thread; call this when positions have just changed."""
         self._arc.read(self._data.qpos[self._free].tolist())
         if self.stage == OUTSIDE:
             self._try_entry()
@@ -283,7 +284,7 @@ class Tissue:
         self._follow_thread()
 
     def _note_skin(self) -> None:
-        """Note where the pierced places lie now."""
+        """Record where the pierced points lie now."""
         passage = self._passages[-1]
         for index in self._skin_holds:
             if index == 0:
@@ -292,10 +293,10 @@ class Tissue:
                 passage.exit_now = self._holds.anchor(1)
 
     def embed(self) -> None:
-        """Begin anew with a needle that was put where it is: in the tissue or outside.
+        """Begin anew with a needle that was put where it is, in the tissue or outside.
 
-        A needle whose arc leads through the tissue has pierced it along that arc, and pulls at
-        nothing.
+        A needle whose arc leads through the tissue counts as having pierced it along that arc, and
+        pulls at nothing.
         """
         self.clear()
         self._arc.read(self._data.qpos[self._free].tolist())
@@ -390,7 +391,7 @@ class Tissue:
         self._holds.rub(resistance, 0.0)
 
     def _lifted(self) -> tuple[int, float]:
-        """Return the flank that the tip lifts from inside, and how far [m]; none where it is 0."""
+        """Return the flank that the tip lifts from inside and how far [m], or `NO_FLANK`, 0."""
         tip = self._arc.tip
         first = 2 * self._ridge.nearest_piece(tip)
         for flank in (first, first + 1):
@@ -400,7 +401,7 @@ class Tissue:
         return NO_FLANK, 0.0
 
     def _come_out(self, flank: int) -> bool:
-        """Go through the skin from inside; return False where the arc does not cross it."""
+        """Go through the skin from inside; return False if the arc does not cross it."""
         angle = self._arc.crossing(flank, self._arc.tip_angle, inward=False)
         if angle is None or not 0.0 <= (self._arc.tip_angle - angle) * self._arc.radius < SEARCH:
             return False
@@ -458,7 +459,7 @@ class Tissue:
         self._holds.rub(0.0, self.forces.friction * left)
 
     def _extend_path(self) -> None:
-        """Append the tip's way since the last point, at equal distances."""
+        """Append the tip's path since the last point, at equal distances."""
         path = self._path
         tip = self._arc.tip
         last = path[-1]
@@ -474,7 +475,7 @@ class Tissue:
             distance -= SPACING
 
     def _follow_thread(self) -> None:
-        """Let the thread go on through the places that hold it."""
+        """Let the thread move on through the places that hold it."""
         drawn = self._thread.follow()
         if drawn is not None:
             self.thread_drawn = drawn
@@ -501,7 +502,7 @@ class Tissue:
             self._passages[-1].tears += tears
 
     def _write(self) -> None:
-        """Write to the model what touches what: the needle the skin, the thread the flanks."""
+        """Write to the model what can touch: the needle the skin, and the thread the flanks."""
         bits = self._model.geom_conaffinity
         bits[self._skin] = 0 if self.stage else SURFACES
         pierced = {
@@ -518,7 +519,7 @@ class Tissue:
     # -- state -------------------------------------------------------------------------------------
 
     def pack(self) -> list[float]:
-        """Return everything but what MuJoCo's own state has, as at most `SIZE` numbers."""
+        """Return everything that MuJoCo's own state lacks, as at most `SIZE` numbers."""
         values = [
             *(self.stage, self.tears, self.thread_drawn, self._front),
             *self._entry_anchor,
@@ -535,7 +536,7 @@ class Tissue:
         return values
 
     def unpack(self, values: Sequence[float]) -> None:
-        """Take what `pack` returned; MuJoCo's state must be set already."""
+        """Restore what `pack` returned; MuJoCo's state must already be set."""
         self.stage = int(values[0])
         self.tears = int(values[1])
         self.thread_drawn = values[2]
@@ -561,4 +562,4 @@ def _point(values: Sequence[float], start: int) -> Point:
 
 
 _STAGES = {INSIDE: Tissue._go_in, THROUGH: Tissue._go_through, TRAILING: Tissue._trail}
-"""Stage → what follows the needle in it."""
+"""Stage → the method that follows the needle in it."""

@@ -1,22 +1,23 @@
 """Upset: one thing that goes wrong in an episode, once.
 
     upset = Upset(env, plan_upset(seed, task))   # after env.reset(seed=seed)
-    upset.before_step()                          # may push the needle; True if it did: look again
+    upset.before_step()                          # may push the needle; if True, observe again
     action = upset.altered(action)               # may open the jaws
     env.step(action)
 
 What can go wrong (`KINDS`):
 
-* `push`: the needle that lies free before its grasp moves by `PUSH` in a random direction, and
-  stays on the phantom;
+* `push`: the needle, lying free before its grasp, moves by `PUSH` in a random direction and stays
+  on the phantom;
 * `drop`: PSM2's jaws open while they hold the needle, before its tip is in the tissue;
 * `insertion`: PSM2's jaws open while the needle's tip is in the tissue;
-* `handoff`: PSM1's jaws open as they close on the needle or just after they took it.
+* `handoff`: PSM1's jaws open as they close on the needle or just after they grasped it.
 
-It happens `wait` control steps after it first can, drawn from `WAITS`: a moment within the phase.
-An upset is no part of the env: an opening alters executed actions, a push sets the needle's pose by
-`Simulation.pose_needle`. So the scene, the state vector and undisturbed episodes are what they are
-without it. What happens depends on the episode's seed and on what the env is in, on nothing else.
+It happens `wait` control steps after it first can. `wait` is drawn from `WAITS`, so that the moment
+is within the phase. An upset is not part of the env: opening jaws alter the executed actions, a
+push sets the needle's pose by `Simulation.pose_needle`. So the scene, the state vector and
+undisturbed episodes are the same as without it. What happens depends only on the episode's seed and
+the env's state.
 """
 
 import math
@@ -37,9 +38,9 @@ from surgicai_vision.scene import needle
 from surgicai_vision.scene.phantom import ORIGIN, SIZE
 
 JAW = names.ACTION_NAMES.index("jaw")
-"""Place of the jaws in an action."""
+"""Index of the jaws in an action."""
 UPSET_STREAM = 0x0B5E7
-"""Sets an upset's random numbers apart from the start's and the noise's, of the same seed."""
+"""Separates an upset's random numbers from the start's and the noise's for the same seed."""
 PUSH = 0.005
 """How far the needle is pushed [m] (issue 17)."""
 DIRECTIONS = 16
@@ -47,13 +48,13 @@ DIRECTIONS = 16
 EDGE = 0.002
 """How far a pushed needle stays from the pad's edges [m]."""
 NEAR = 0.006
-"""Jaws that come this near to the needle [m] bring a push about that still waited."""
+"""Jaws that come this near to the needle [m] trigger a push that is still waiting."""
 OPENING_STEPS = 6
 """Control steps for which jaws open: 0.3 rad at the paper's step size."""
 CLOSING_JAW = 0.12
-"""Jaws commanded below this angle [rad] are closing, or closed: the expert goes in with 0.18."""
+"""Jaws commanded below this angle [rad] are closing, or closed: the expert approaches with 0.18."""
 CLOSING_RANGE = 0.004
-"""Distance of PSM1's jaws from the point they are to take, below which they take it [m]."""
+"""Distance of PSM1's jaws from the point they are to grasp, below which they grasp it [m]."""
 
 KINDS = ("push", "drop", "insertion", "handoff")
 WAITS: Mapping[str, tuple[int, int]] = MappingProxyType(
@@ -97,7 +98,7 @@ def check_upset_task(task: str) -> None:
 
 
 def plan_upset(seed: int, task: str, fraction: float = 1.0) -> UpsetPlan | None:
-    """Draw the upset of one episode; None where it has none.
+    """Draw the upset of one episode; None if it has none.
 
     Args:
         seed: of the episode's start.
@@ -113,7 +114,7 @@ def plan_upset(seed: int, task: str, fraction: float = 1.0) -> UpsetPlan | None:
         return None
     kinds = TASK_KINDS[task]
     kind = kinds[int(rng.integers(len(kinds)))]
-    # A subtask's own episode ends at its success: the jaws open as they first close.
+    # An episode of this subtask alone ends at its success, so the jaws open as they first close.
     wait = 0 if task == "handoff" else int(rng.integers(*WAITS[kind], endpoint=True))
     return UpsetPlan(kind, wait, float(rng.uniform(0.0, 2 * math.pi)))
 
@@ -143,10 +144,10 @@ class Upset:
         return self._plan.kind if self._plan is not None and self.step >= 0 else ""
 
     def before_step(self) -> bool:
-        """Let it happen where it is due; return True if the needle was pushed.
+        """Let the upset happen if it is due; return True if the needle was pushed.
 
-        To be called before every control step, and before anybody looks at the state. A push that
-        finds no room is tried again at the next step.
+        Call this before every control step, and before the state is observed. A push that finds no
+        room is tried again at the next step.
         """
         plan = self._plan
         if plan is None or self.step >= 0:
@@ -165,7 +166,7 @@ class Upset:
         return is_push
 
     def altered(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what is executed in the place of `action`, (7,): jaws that open, or itself."""
+        """Return what is executed instead of `action`, (7,): opening jaws, or `action` itself."""
         if not self._opening:
             return action
         self._opening -= 1
@@ -218,15 +219,15 @@ _POSSIBLE = MappingProxyType(
         "handoff": _can_open_handing,
     }
 )
-"""Kind → whether it can happen now, and whether it must, for soon it no longer can."""
+"""Kind → whether it can happen now, and whether it must because soon it no longer can."""
 
 
 def _push(env: SuturingEnv, heading: float) -> bool:
-    """Push the needle by `PUSH`; return False where no direction leaves it free on the phantom.
+    """Push the needle by `PUSH`; return False if no direction leaves it free on the phantom.
 
     Args:
         env: the env, whose needle lies free.
-        heading: the first direction tried [rad]; others follow in equal turns.
+        heading: the first direction tried [rad]; others follow at equal angles.
     """
     simulation = env.simulation
     before = simulation.needle()

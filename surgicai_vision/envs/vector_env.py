@@ -2,11 +2,11 @@
 
     gymnasium.make_vec("surgicai_vision/Insert-v0", 16, workers=2)
 
-gymnasium's own `async` mode gives each env a process and a message a step; in state mode the
+gymnasium's own `async` mode gives each env a process and a message per step; in state mode the
 message costs as much as the step, so two workers are no faster than one. Here a worker steps its
-share of the envs by a `SyncVectorEnv` and answers once for all of them; observations come back
+share of the envs with a `SyncVectorEnv` and answers once for all of them; observations come back
 through shared memory. Trajectories, infos and autoreset are those of `SyncVectorEnv`, whatever the
-number of workers: `benchmarks/speed.py --only workers` measures it.
+number of workers. `benchmarks/speed.py --only workers` measures the speed.
 """
 
 import itertools
@@ -31,7 +31,7 @@ from surgicai_vision.envs.success import Info
 Tree = Any
 """Arrays, or dicts of trees."""
 Arguments = dict[str, Any]
-"""What `make_task` takes, by name."""
+"""Keyword arguments of `make_task`."""
 Step = tuple[Tree, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]
 
 
@@ -157,7 +157,7 @@ class SuturingVectorEnv(VectorEnv):
         return self.call(name)
 
     def set_attr(self, name: str, values: object) -> None:
-        """Set an attribute of each env, one value for all or a list of as many."""
+        """Set an attribute of each env, to one value for all or to a list with one per env."""
         self._check_open()
         rows = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
         if len(rows) != self.num_envs:
@@ -181,7 +181,7 @@ class SuturingVectorEnv(VectorEnv):
             raise InputError("The vector env is closed; make a new one.")
 
     def _ask_all(self, what: str, arguments: Sequence[object]) -> list[Any]:
-        """Send each worker its part, then collect the answers; a worker's error ends all."""
+        """Send each worker its part, then collect the answers; one worker's error ends all."""
         try:
             for worker, part in zip(self._workers, arguments, strict=True):
                 worker.connection.send((what, part))
@@ -204,7 +204,7 @@ class SuturingVectorEnv(VectorEnv):
 
 
 class _Failure:
-    """An error in a worker, and where it happened there."""
+    """An error in a worker, with its traceback there."""
 
     def __init__(self, error: Exception):
         self.error = error
@@ -243,7 +243,7 @@ def _work(
 
 
 def _answer(vector: SyncVectorEnv, what: str, part: Any, seen: Tree, share: slice) -> object:
-    """Do what is asked; observations go to shared memory."""
+    """Handle a request; observations go to shared memory."""
     if what == "step":
         observation, *rest = vector.step(*part)
         _write(seen, share, observation)

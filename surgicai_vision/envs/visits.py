@@ -1,13 +1,13 @@
 """Visits: when each subtask of a whole procedure was begun, met and left.
 
-A `VisitWatch` only reads, and is never asked by what acts: it measures whether ends were right. A
-*visit* is a run of control steps with one subtask on. It is left when another subtask is on, which
-whoever acts decides, or the env (`TaskConfig.advance`). Left for a later subtask the visit was
-*ended*: too late by its `delay`, or falsely, before its success was measured. Left for an earlier
-one it was broken off, which is no end.
+A `VisitWatch` only reads, and never informs whoever acts: it measures whether ends were correct. A
+*visit* is a run of control steps with one active subtask. It is left when another subtask becomes
+active, which is decided by whoever acts, or by the env (`TaskConfig.advance`). A visit left for a
+later subtask was *ended*: too late by its `delay`, or falsely, before its success was measured. A
+visit left for an earlier one was broken off, which is not an end.
 
-The success of a visit is the paper's own, by any target that will do for what follows
-(`envs.success.judge`): a grasp's at any angle of the range that goals are drawn from.
+The success of a visit is the paper's own, by any target that suffices for what follows
+(`envs.success.judge`): for a grasp, at any angle in the range that goals are drawn from.
 """
 
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ from surgicai_vision.envs.success import Info
 from surgicai_vision.envs.suture import Suture
 
 LAST = -1
-"""What follows the visit with which an episode ended."""
+"""`following` of the visit with which an episode ended."""
 
 
 @dataclass(frozen=True)
 class Visit:
-    """One visit of a subtask; times are control steps since the episode's start.
+    """One visit to a subtask; times are control steps since the episode's start.
 
     Attributes:
         subtask: index in `names.SUBTASKS`.
         began: when it began.
         left: when it was left, or the episode ended.
-        following: the subtask that was on next; `LAST` where the episode ended.
+        following: the subtask that became active next; `LAST` if the episode ended.
         met: when the subtask's success was first measured in this visit; None if it was not.
         was_met: whether it had been met in an earlier visit and no needle was dropped since.
     """
@@ -52,7 +52,7 @@ class Visit:
 
     @property
     def delay(self) -> float | None:
-        """Return how long after its success it was ended [s]; None where it was not."""
+        """Return how long after its success it was ended [s]; None without success or end."""
         if self.met is None or not self.is_end:
             return None
         return (self.left - self.met) / names.FPS
@@ -62,7 +62,7 @@ class VisitWatch:
     """The visits of the present episode of `env`; see the module's docstring.
 
     Args:
-        env: the env to read; `begin` follows each of its resets, `update` each of its steps.
+        env: the env to read; call `begin` after each of its resets, `update` after each step.
     """
 
     def __init__(self, env: Suture):
@@ -80,7 +80,7 @@ class VisitWatch:
 
     def update(self, info: Info) -> None:
         """Read the state that a step ended in; `info` is that step's."""
-        # The subtask under which the step was taken: the env may have gone on at its end.
+        # The subtask in which the step was taken: the env may have advanced at its end.
         if info["phase"] != self._subtask:
             self._left.append(self._visit(info["phase"]))
             self._enter(info["phase"])

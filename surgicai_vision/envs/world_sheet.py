@@ -1,7 +1,7 @@
-"""World sheet: every needle and the phantom's places as rows of images, for people to judge.
+"""World sheet: every needle and the phantom's placements as rows of images, for visual inspection.
 
 `needle_rows` shows the start of a grasp with every radius, arc and thickness; `placement_rows` the
-start of an insertion in every pair with the phantom at the corners of its places.
+start of an insertion in every pair with the phantom at the extremes of its placement.
 """
 
 import itertools
@@ -35,9 +35,9 @@ SIGNS = (-1.0, 0.0, 1.0)
 def needle_rows(
     scene: SceneConfig, view: str, seed: int, size: int, quality: str
 ) -> tuple[Rows, list[str]]:
-    """Return (size, size, 3) images of lying needles and what the columns are.
+    """Return (size, size, 3) images of lying needles and the names of the columns.
 
-    A row is a radius; its columns are every thickness of every arc.
+    Each row is a radius; its columns are all thicknesses of all arcs.
 
     Args:
         scene: the scene.
@@ -73,9 +73,9 @@ def needle_rows(
 def placement_rows(
     scene: SceneConfig, view: str, seed: int, size: int, quality: str
 ) -> tuple[Rows, list[str]]:
-    """Return (size, size, 3) images of the phantom's places and what the columns are.
+    """Return (size, size, 3) images of the phantom's placements and the names of the columns.
 
-    A row is a pair that is sewn; its columns are the phantom's own place and the corners.
+    Each row is a pair that is sewn; its columns are the phantom's own place and the extremes.
     """
     shift = RANDOMISATION_LIMITS["phantom_shift"]
     turn = RANDOMISATION_LIMITS["phantom_turn"]
@@ -104,7 +104,7 @@ def _percent(what: str, share: float) -> str:
 def _image(
     config: TaskConfig, given: Numbers, view: str, seed: int, size: tuple[int, int], quality: str
 ) -> Image:
-    """Return the start of an episode in a world of given numbers."""
+    """Return an image of an episode's start with given randomisation numbers."""
     env = make(config)
     env.reset(seed=seed, options={"randomisation": given})
     image: Image = env.image(view, size, quality=quality).astype(np.uint8)
@@ -115,7 +115,7 @@ def _image(
 def _close(
     config: TaskConfig, given: Numbers, view: str, seed: int, size: int, quality: str
 ) -> Image:
-    """Return a cut-out about the needle."""
+    """Return a cut-out about the needle at an episode's start."""
     env = make(config)
     env.reset(seed=seed, options={"randomisation": given})
     whole = CLOSE * size

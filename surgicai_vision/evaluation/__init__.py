@@ -1,1 +1,1 @@
-"""Evaluation: policies on held-out starts, counted from the measured state."""
+"""Evaluation: run policies from held-out starts and judge them by the measured state."""

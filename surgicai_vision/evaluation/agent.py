@@ -1,8 +1,8 @@
 """The agent: what acts in an evaluation, with every member that callers use.
 
-An agent asks what it moves for nothing but what `Robot` has, and an env is one. What reads the
-env's own state (an expert, ends by measured success, a policy fed the privileged state) says so in
-`Agent.privileged`, and then `simulated(robot)` is its env.
+An agent uses only the members of `Robot`, which every env has. An agent that reads the env's own
+state (an expert, ends by measured success, a policy fed the privileged state) declares it in
+`Agent.privileged` and gets its env from `simulated(robot)`.
 """
 
 import abc
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 type Env = base.SuturingEnv
 type Observation = base.Observation
 type Actions = NDArray[np.float32]
-"""One action a slot, (n, 7), of an agent with action mode "absolute" (n, 16)."""
+"""One action per slot, (n, 7); (n, 16) for an agent with action mode "absolute"."""
 
 
 class Robot(Protocol):
-    """All that an agent may ask of what it moves, beside the images."""
+    """All that an agent may ask of the robot it moves, besides the images."""
 
     def agent_pos(self) -> NDArray[np.float32]:
         """Return the active arm's measured tip in its base, (7,): x y z, roll pitch yaw, jaw.
@@ -37,13 +37,13 @@ class Robot(Protocol):
         """Return both arms' `agent_pos`, psm1 first, (14,)."""
 
     def setpoint(self) -> NDArray[np.float32]:
-        """Return how far the active arm's set point lies from its measured tip, (7,).
+        """Return the offset of the active arm's set point from its measured tip, (7,).
 
         x y z [m] and the rotation vector [rad] in its base, and the jaw [rad].
         """
 
     def enter(self, phase: int) -> None:
-        """Make a subtask, an index in `names.SUBTASKS`, the present one: its arm is active now."""
+        """Enter a subtask, an index in `names.SUBTASKS`: its arm becomes the active one."""
 
 
 def simulated(robot: Robot) -> Env:
@@ -65,11 +65,11 @@ class Agent(abc.ABC):
     """What acts in the slots of an evaluation.
 
     Attributes:
-        name: how the agent is called in messages; an evaluation names it as its tables do.
+        name: the agent's name in messages; an evaluation sets it to the name in its tables.
         cameras: cameras it needs, empty for none.
         image_size: height and width of their images [px].
         depth: whether it needs their depth too.
-        privileged: whether it reads the env's own state: it acts in simulation alone.
+        privileged: whether it reads the env's own state, so that it acts only in simulation.
         action_mode: what its actions are, one of `names.ACTION_MODES`: "increments" of the active
             arm, or "absolute" set-points of both (`envs.absolute`), which only an env takes.
     """
@@ -89,10 +89,10 @@ class Agent(abc.ABC):
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the actions (len(slots), 7) of the running slots; absolute ones have 16."""
+        """Return the actions (len(slots), 7) of the running slots; absolute ones have 16 values."""
 
     def restart(self, slot: int) -> None:
-        """Forget what the slot has planned: its subtask begins, within the same episode."""
+        """Forget what the slot has planned: a subtask begins within the same episode."""
         return
 
     def share(self, features: FeatureTable) -> None:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 EXPERT = "expert"
 RECOVER = "recover"
-"""The expert, and the one of the whole procedure that goes back to what was lost."""
+"""The expert, and the expert of the whole procedure that goes back after a loss."""
 
 
 @final
@@ -55,7 +55,7 @@ class ExpertAgent(Agent):
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the experts' actions (n, 7); not a number where the expert knows no way on."""
+        """Return the experts' actions (n, 7); NaN where an expert's next pose is unreachable."""
         actions = np.full((len(slots), 7), np.nan, np.float32)
         for row, slot in enumerate(slots):
             try:
@@ -105,7 +105,7 @@ class ZeroAgent(Agent):
 
 @final
 class ReplayAgent(Agent):
-    """Blind replay: the same actions in every episode, then none.
+    """Blind replay: the same actions in every episode, then zeros.
 
     Args:
         actions: (T, 7), one for each control step.
@@ -159,9 +159,9 @@ VECTORS: Mapping[str, Callable[[Robot], NDArray[np.float32]]] = MappingProxyType
         names.RELATIVE_STATE: lambda robot: simulated(robot).relative_state(),
     }
 )
-"""What a robot tells of what a policy may be fed beside features.
+"""Inputs besides features that a policy may get from its robot.
 
-The clock and the progress the agent knows itself; they stand last.
+The clock and the progress come from the agent itself and are appended last.
 """
 
 BASELINES: Mapping[str, Callable[[], Agent]] = MappingProxyType(
@@ -180,13 +180,13 @@ class PolicyAgent(Agent):
     """A trained policy; it sees the images of its views and the measured pose of its tip.
 
     Args:
-        name: how tables call it.
+        name: its name in tables.
         policy: has `act(features (B, F) or None, agent_pos (B, 7)) -> (B, 7)`.
         encoder: frames (B, H, W, 3) → features (B, dim), or None for a policy without images.
         views: the policy's views, in the order of its features.
         image_size: height and width the policy was trained on [px].
-        vector: what it is fed beside its features, keys of `policies.base.VECTORS`.
-        progress: says the progress that the policy is fed with `names.PROGRESS`.
+        vector: its inputs besides features, keys of `policies.base.VECTORS`.
+        progress: predicts the progress, for a policy with `names.PROGRESS` as an input.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class PolicyAgent(Agent):
         self.restart(slot)
 
     def restart(self, slot: int) -> None:
-        """Start the slot's clock anew: its subtask begins."""
+        """Restart the slot's clock: a subtask begins."""
         self._ticks[slot] = 0
 
     def act(
@@ -245,7 +245,7 @@ class PolicyAgent(Agent):
         """Return the policy's answers (n, …): actions, or a high-level policy's logits.
 
         Args:
-            robots: what is moved, for proprioception.
+            robots: the robots, for proprioception.
             observations: their observations.
             ticks: control steps since each robot's subtask began, for a policy with a clock.
         """
@@ -259,7 +259,7 @@ class PolicyAgent(Agent):
         observations: Sequence[Observation],
         ticks: Sequence[int] | None = None,
     ) -> NDArray[np.float32]:
-        """Return what is fed beside the features, (n, …); see `answer`."""
+        """Return the inputs besides the features, (n, …); see `answer`."""
         vectors = np.stack(
             [np.concatenate([told(robot) for told in self._told]) for robot in robots]
         )

@@ -5,10 +5,10 @@ Interface:
 * `ChunkAgent(policy, senses)`: an agent; `senses` is the same policy's `PolicyAgent`, which reads
   vectors and features and never acts.
 
-Each slot plans by itself, in a batch of one and with random numbers of its own seed and step, so
-that a result depends neither on the batch nor on the processes. An image is looked at and encoded
-when it is seen, and only where this plan or a later one needs it: an env that renders its images
-when they are looked at cannot show one later. `restart` forgets what is planned.
+Each slot plans by itself, in a batch of one, with random numbers drawn from its own seed and step.
+A result therefore depends neither on the batch nor on the processes. An image is read and encoded
+when its observation arrives, and only if this plan or a later one needs it: an env that renders
+images on access cannot show one later. `restart` forgets what is planned.
 """
 
 from collections import deque
@@ -34,7 +34,7 @@ class _Moment:
 
     Attributes:
         features: of its images (F,), float32; None where no plan needs them, or without views.
-        vector: what stands beside them (n,).
+        vector: the other inputs (n,).
     """
 
     features: NDArray[np.float32] | None
@@ -63,8 +63,8 @@ class ChunkAgent(Agent):
     """Plans a chunk of actions, executes its beginning and plans anew.
 
     Args:
-        policy: plans.
-        senses: the same policy's eyes and proprioception.
+        policy: makes the plans.
+        senses: reads the same policy's features and vectors.
     """
 
     def __init__(self, policy: ChunkPolicy, senses: PolicyAgent):
@@ -116,7 +116,7 @@ class ChunkAgent(Agent):
         return tick % self._policy.execute == 0
 
     def _is_planned_from(self, tick: int) -> bool:
-        """Return True if a plan sees the observation of `tick`: its own or a later one."""
+        """Return True if a plan made at `tick` or later sees the observation of `tick`."""
         policy = self._policy
         return any(self._is_due(tick + moment * policy.spacing) for moment in range(policy.history))
 
@@ -154,7 +154,7 @@ class ChunkAgent(Agent):
     def _history(self, episode: _Episode) -> list[_Moment]:
         """Return the moments that the policy sees, the present one last.
 
-        At the start the first stands for what came before.
+        At the start, the first moment is repeated for those before it.
         """
         past = episode.past
         back = [
@@ -164,7 +164,7 @@ class ChunkAgent(Agent):
         return [past[max(0, at)] for at in back]
 
     def _action(self, episode: _Episode) -> NDArray[np.float32]:
-        """Return the action of this step (7,), of the newest plan or the mean of all."""
+        """Return the action of this step (7,), from the newest plan or averaged over all plans."""
         held = [
             plan[episode.tick - tick]
             for tick, plan in episode.plans

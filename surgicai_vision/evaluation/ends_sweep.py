@@ -1,12 +1,12 @@
-"""Ends sweep: how sure and how patient the ends of a hierarchical policy should be.
+"""Ends sweep: choose `confidence` and `patience` for the ends of a hierarchical policy.
 
-`sweep_ends` evaluates a hierarchical policy with learned ends at every `confidence` and `patience`
-on validation starts, one evaluation folder each, and writes the best of them as
-`DIR/hierarchical.yaml`, which `evaluate` takes. What is there already is kept, so running again
+`sweep_ends` evaluates a hierarchical policy with learned ends for every pair of `confidence` and
+`patience` on validation starts, one evaluation folder per pair. It writes the best pair as
+`DIR/hierarchical.yaml`, which `evaluate` takes. Existing results are kept, so running again
 continues.
 
-Best is what sews most; of those what ends the fewest subtasks falsely, and then what ends them
-soonest. Test starts are refused: what is chosen on them cannot be measured on them.
+The best pair completes the most procedures; among equals, it ends the fewest subtasks falsely, then
+ends them soonest. Test starts are refused: a policy chosen on them cannot be measured on them.
 """
 
 import dataclasses
@@ -41,16 +41,16 @@ MARK = "ends.json"
 
 @dataclass(frozen=True)
 class Ends:
-    """What one pair of settings came to.
+    """Outcome of one pair of settings.
 
     Attributes:
         confidence: of `HierarchicalConfig`.
         patience: of `HierarchicalConfig`.
-        successes: whole procedures that were sewn.
+        successes: whole procedures that succeeded.
         episodes: validation starts.
-        false_ends: subtasks ended before their measured success, a procedure.
+        false_ends: subtasks ended before their measured success, per procedure.
         delay_s: mean over procedures of the median time from measured success to end [s]; None
-            where nothing was ended after it.
+            where no subtask was ended after its success.
     """
 
     confidence: float
@@ -61,7 +61,7 @@ class Ends:
     delay_s: float | None
 
     def rank(self) -> tuple[float, float, float]:
-        """Return what the best pair has the least of, the first counting most."""
+        """Return the key by which pairs are sorted; the best pair has the smallest."""
         late = float("inf") if self.delay_s is None else self.delay_s
         return -self.successes, self.false_ends, late
 
@@ -108,7 +108,7 @@ def sweep_ends(
         dataclasses.replace(given, confidence=confidence, patience=patience)
         for confidence, patience in itertools.product(confidences, patiences)
     ]
-    # Whatever pairs are tried: a later call may try others in the same folder.
+    # Without the pair's values: a later call may try other pairs in the same folder.
     policy = {**to_mapping(given), "confidence": None, "patience": None}
     owner = {
         "hierarchical": policy,
@@ -131,7 +131,7 @@ def sweep_ends(
 
 
 def _ends(config: HierarchicalConfig, summary: Row) -> Ends:
-    """Return what an evaluation's summary says of the ends."""
+    """Return what an evaluation's summary says about the ends."""
     return Ends(
         config.confidence,
         config.patience,

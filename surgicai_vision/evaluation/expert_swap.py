@@ -1,8 +1,8 @@
-"""Expert swap: how far episodes of a hierarchical policy come with the expert in for one subtask.
+"""Expert swap: how far a hierarchical policy gets when the expert does one of its subtasks.
 
 `evaluate_swaps` evaluates the policy as it is and with each subtask given to the expert in turn,
-on the same starts, one evaluation folder each, and writes `expert_swap.parquet`: for every variant
-and subtask the episodes that finished it and all before it.
+on the same starts, one evaluation folder per variant. It writes `expert_swap.parquet`: for every
+variant and subtask, the number of episodes that finished it and all before it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ EXPERT, AS_IT_IS = "expert", "as-it-is"
 def variants_of(
     path: Path, env: Mapping[str, JSON] | None = None, weights: WeightsSource = ANYWHERE
 ) -> dict[str, PolicySpec]:
-    """Return the policy as it is, then with each subtask swapped that is not the expert's already.
+    """Return the policy as it is, then with the expert in each subtask that it does not do already.
 
     Args:
         path: the YAML file of a hierarchical policy.
@@ -53,7 +53,7 @@ def evaluate_swaps(
 ) -> list[Row]:
     """Evaluate every variant into `out`, and return the rows of `expert_swap.parquet`.
 
-    What is there already is kept, so running again continues.
+    Existing results are kept, so running again continues.
 
     Args:
         variants: folder name → what is evaluated, from `variants_of`.
@@ -109,7 +109,7 @@ def _stages(expert_swap: str, stages: Sequence[int]) -> list[Row]:
 
 
 def _claim(out: Path, spec: PolicySpec, seeds: Sequence[int]) -> None:
-    """Write which policy is evaluated where into `out`, or refuse a folder of another one."""
+    """Record in `out` which policy is evaluated on which starts; refuse another one's folder."""
     mine = {
         "hierarchical": spec.about["hierarchical"],
         "task_config": to_mapping(spec.config),

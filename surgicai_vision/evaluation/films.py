@@ -1,12 +1,12 @@
-"""Filming: episodes of an evaluation become videos, one file each.
+"""Filming: write episodes of an evaluation as videos, one file per episode.
 
     filming = Filming(Path("outputs/videos"), of="failures", views=("front", "back"))
     evaluate(make_agent, config, seeds, filming=filming)
 
 `DIR/<task>-<seed>-<outcome>.mp4` shows the views side by side and, below them, what is measured
-(`video_frames`). The process that ran an episode films it from its states, every second one, so an
-evaluation's rows are the same with and without. `DIR/videos.json` lists the videos, the last file
-to be written; a folder with it is filmed into anew, and what it lists is removed before.
+(`video_frames`). The process that ran an episode films it from every other one of its states, so
+filming does not change an evaluation's rows. `DIR/videos.json`, written last, lists the videos. A
+folder that holds it may be filmed into again; the videos it lists are removed first.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ FAILURES: Final = "failures"
 SUCCESSES: Final = "successes"
 CHOICES: Final = (ALL, FAILURES, SUCCESSES)
 LAST_S: Final = 1.5
-"""Time for which a video's last image stands [s]: the outcome is written on it."""
+"""Time for which a video's last image is held [s]; the outcome is written on it."""
 SIDES: Final = (64, 960)
 """Smallest and largest height of a view [px]."""
 
@@ -47,8 +47,8 @@ class Look:
     Attributes:
         views: cameras, side by side in this order.
         size: height and width of each view [px], even.
-        every: control steps from one image to the next; 2 gives 25 images a second.
-        speed: of the world in the video; 0.5 is slow motion.
+        every: control steps from one image to the next; 2 gives 25 images per second.
+        speed: playback speed, as a share of real time; 0.5 is slow motion.
         quality: of the images, "fast" or "high" (ten times slower).
     """
 
@@ -75,7 +75,7 @@ class Look:
 
     @property
     def fps(self) -> float:
-        """Images a second of the video."""
+        """Images per second of the video."""
         return names.FPS / self.every * self.speed
 
 
@@ -85,10 +85,10 @@ class Filming:
 
     Attributes:
         folder: gets the videos.
-        of: "all", "failures", "successes", or a number: the first so many starts.
+        of: "all", "failures", "successes", or a number: that many starts, the first ones.
         look: how they look.
-        title: what is written on them beside the start's seed; "" takes the policy's name.
-        first: the starts that `of` counted; `begun` fills it in.
+        title: text on them, followed by the start's seed; "" takes the policy's name.
+        first: seeds of the starts that a number in `of` selects; `begun` sets it.
     """
 
     folder: Path
@@ -104,7 +104,7 @@ class Filming:
             )
 
     def begun(self, seeds: Sequence[int]) -> "Filming":
-        """Return this filming for an evaluation of `seeds`; its folder is emptied.
+        """Return this filming for an evaluation of `seeds`; earlier videos are removed.
 
         Raises:
             OutputExists: the folder holds other files.
@@ -119,7 +119,7 @@ class Filming:
         return dataclasses.replace(self, first=tuple(int(seed) for seed in seeds[:count]))
 
     def videos(self) -> list[str]:
-        """Return the names of the videos that the folder's list has."""
+        """Return the names of the videos in the folder's list."""
         return [Path(row["file"]).name for row in files.read_json(self.folder / INDEX)["videos"]]
 
     def wants(self, row: EpisodeMetrics) -> bool:
@@ -145,7 +145,7 @@ class Filming:
         """
         if not states or not self.wants(row):
             return
-        # An evaluation that was killed may have left one of another outcome.
+        # An evaluation that was killed may have left a video with another outcome.
         for earlier in self.folder.glob(f"{row.task}-{row.seed}-*{SUFFIX}"):
             earlier.unlink()
         title = f"{self.title or row.policy}, start {row.seed}"

@@ -1,22 +1,22 @@
-"""Hierarchical policies: the whole procedure by a high-level policy over a policy a subtask.
+"""Hierarchical policies: the whole procedure by a high-level policy over one policy per subtask.
 
 HLP → LLP → termination → HLP: the high-level policy says which subtask is due, that subtask's
-policy moves its arm until the subtask ends, and the high-level policy is asked again. A subtask
+policy moves its arm until the subtask ends, and the high-level policy is queried again. A subtask
 ends
 
-* `learned`: when the high-level policy itself names another subtask. It is asked every
+* `learned`: when the high-level policy itself names another subtask. It is queried every
   `decide_every` control steps, and believed when it has named the same other subtask `patience`
-  times in a row, each time with a probability of at least `confidence`. The env goes on when it is
-  told and not before (`TaskConfig.advance`): nothing that is measured of needle or tissue decides
+  times in a row, each time with a probability of at least `confidence`. The env advances when it is
+  told to and not before (`TaskConfig.advance`): no measurement of needle or tissue decides
   anything;
 * `privileged`: when the env's measured success has held (a grasp's for `grasp_hold` steps), as in
-  the released code: a control, which no robot has;
-* in either case after `steps` control steps (paper: 200): the high-level policy is asked, its
-  likeliest subtask is taken at once, and the same one begins anew where it names that.
+  the released code. This is a control; no robot has this measurement;
+* in either case after `steps` control steps (paper: 200): the high-level policy is queried, and its
+  most probable subtask begins at once, which may be the same one anew.
 
 After `decisions` decisions (paper: 50) both arms hold still.
 
-A hierarchical policy is a YAML file, which `surgicai-vision evaluate hierarchical.yaml` takes
+A YAML file describes a hierarchical policy; `surgicai-vision evaluate hierarchical.yaml` takes it
 (docs/hierarchical.md):
 
     hlp: outputs/train/suture-hlp-…   # a checkpoint, or `order`: the subtasks in their order
@@ -54,14 +54,14 @@ GRASP = names.SUBTASKS.index("grasp")
 
 @dataclass
 class _EpisodeState:
-    """Where one episode stands; made anew with every decision.
+    """State of one episode; replaced with every decision.
 
     Attributes:
-        subtask: the one that is on; -1 before the first decision.
+        subtask: the current one; -1 before the first decision.
         steps: control steps it has taken.
         decisions: decisions taken in the episode.
         named: the other subtask that the high-level policy named last; -1 where it named none.
-        times: how often in a row it has.
+        times: how often in a row it has named it.
     """
 
     subtask: int = -1
@@ -73,7 +73,7 @@ class _EpisodeState:
 
 @dataclass(frozen=True)
 class _Choice:
-    """What a high-level policy says: a subtask, and how probable it holds it."""
+    """Answer of a high-level policy: a subtask and its probability."""
 
     subtask: int
     probability: float = 1.0
@@ -83,10 +83,10 @@ class _Ends(Protocol):
     """When a subtask ends."""
 
     def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
-        """Return True if the high-level policy is asked now."""
+        """Return True if the high-level policy is to be queried now."""
 
     def believes(self, state: _EpisodeState, choice: _Choice) -> bool:
-        """Return True if what it says is a decision."""
+        """Return True if the policy's answer becomes a decision."""
 
 
 @final
@@ -94,14 +94,14 @@ class _PrivilegedEnds:
     """A subtask ends when the env's measured success has held.
 
     Args:
-        grasp_hold: control steps that does for a grasp.
+        grasp_hold: control steps for which a grasp must hold.
     """
 
     def __init__(self, grasp_hold: int):
         self._grasp_hold = grasp_hold
 
     def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
-        """Let the env go on from a grasp that has held long enough; return True if it went on."""
+        """Advance the env from a grasp that has held long enough; return True if it advanced."""
         env = _suture(robot)
         if state.subtask == env.phase == GRASP and env.dwell >= self._grasp_hold:
             env.enter(GRASP + 1)
@@ -124,11 +124,11 @@ class _LearnedEnds:
         self._config = config
 
     def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
-        """Return True every so many steps."""
+        """Return True every `decide_every` steps."""
         return state.steps % self._config.decide_every == 0
 
     def believes(self, state: _EpisodeState, choice: _Choice) -> bool:
-        """Return True once the same other subtask was named often enough in a row."""
+        """Return True once the same other subtask has been named often enough in a row."""
         if choice.subtask == state.subtask or choice.probability < self._config.confidence:
             state.named, state.times = -1, 0
             return False
@@ -141,8 +141,8 @@ class _LearnedEnds:
 class HierarchicalAgent(Agent):
     """A high-level policy over low-level ones; see the module's docstring.
 
-    It tells its robot which subtask, and so which arm, is on, and asks it for measured poses alone;
-    with a privileged termination also whether the present subtask has ended.
+    It tells its robot the current subtask, and so the active arm, and reads only measured poses
+    from it; with a privileged termination, also whether the current subtask has ended.
 
     Args:
         config: when a subtask ends.
@@ -193,7 +193,7 @@ class HierarchicalAgent(Agent):
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the actions (n, 7) of the subtasks that are on, decided anew where one ended."""
+        """Return the actions (n, 7) of the current subtasks; where one has ended, decide anew."""
         self._features.clear()
         states = [self._slots[slot] for slot in slots]
         with one_thread():
@@ -226,7 +226,7 @@ class HierarchicalAgent(Agent):
         robots: Sequence[Robot],
         observations: Sequence[Observation],
     ) -> None:
-        """Ask the high-level policy wherever it is due, and begin what it says.
+        """Query the high-level policy wherever it is due, and begin the subtask it decides on.
 
         Args:
             slots: the running slots.
@@ -245,7 +245,7 @@ class HierarchicalAgent(Agent):
         for row, choice in zip(asked, chosen, strict=True):
             state = states[row]
             if self._is_over(state) or self._ends.believes(state, choice):
-                # In the caller's list too: it acts by the new subtask in this very step.
+                # In the caller's list too, so that the new subtask acts in this very step.
                 states[row] = self._slots[slots[row]] = _EpisodeState(
                     choice.subtask, decisions=state.decisions + 1
                 )
@@ -254,7 +254,7 @@ class HierarchicalAgent(Agent):
                 robots[row].enter(states[row].subtask)
 
     def _is_over(self, state: _EpisodeState) -> bool:
-        """Return True if no subtask is on, or it has taken all its steps."""
+        """Return True if there is no current subtask, or it has taken all its steps."""
         return state.subtask < 0 or state.steps >= self.config.steps
 
     def _choose(
@@ -263,7 +263,7 @@ class HierarchicalAgent(Agent):
         """Return what the high-level policy says for each robot."""
         if self._high is None:
             return [_Choice(_suture(robot).phase) for robot in robots]
-        # Beyond the logits it may say how far the subtask has come.
+        # After the logits it may predict the subtask's progress.
         logits = self._high.answer(robots, observations)[:, : len(names.SUBTASKS)]
         odds = np.exp(logits.astype(np.float64) - logits.max(axis=1, keepdims=True))
         likely = odds.argmax(axis=1)

@@ -5,7 +5,7 @@ Interface:
 * `HierarchicalConfig`: who decides, who acts, and when a subtask ends.
 * `read_hierarchical(path)`, `hierarchical_yaml(config)`: from its YAML file and back.
 
-What it does: `evaluation.hierarchical`.
+`evaluation.hierarchical` describes how such a policy acts.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ MAX_STEPS = 2000
 CONFIDENCES = (0.5, 0.7, 0.9)
 """Values of `HierarchicalConfig.confidence` that a sweep of the ends tries by default."""
 PATIENCES = (1, 2, 3)
-"""Likewise of `HierarchicalConfig.patience`."""
+"""Likewise for `HierarchicalConfig.patience`."""
 
 
 @dataclass(frozen=True)
@@ -42,16 +42,17 @@ class HierarchicalConfig:
         steps: control steps a subtask may take.
         decisions: decisions an episode may take.
         max_steps: control steps an episode may take.
-        grasp_hold: control steps a grasp must hold before it ends as `privileged`, at most the
-            env's own `DWELL`; a policy that learned to search (`demos.search_expert`) lets go again
+        grasp_hold: control steps a grasp must hold before a `privileged` end, at most the env's
+            own `DWELL`; a policy that learned to search (`demos.search_expert`) lets go again
             sooner than that.
         confidence: probability, by the high-level policy's softmax, that another subtask must have
-            before it counts as named (`learned`). More of it means later ends and fewer false ones.
-        patience: how often in a row the high-level policy must name the same other subtask before
-            a `learned` end is believed.
-        decide_every: control steps from one question to the high-level policy to the next
-            (`learned`); only then are its images rendered and encoded. A subtask takes at least
-            `decide_every` times `patience` steps.
+            before it counts as named (`learned`). A higher one means later ends and fewer false
+            ones.
+        patience: how often in a row the high-level policy must name the same other subtask to end
+            the present one (`learned`).
+        decide_every: control steps between queries of the high-level policy (`learned`); only then
+            are its images rendered and encoded. A subtask takes at least `decide_every` times
+            `patience` steps.
     """
 
     hlp: str
@@ -97,12 +98,12 @@ class HierarchicalConfig:
 
     @property
     def advance(self) -> str:
-        """Who takes the env to its next subtask: `TaskConfig.advance`."""
+        """Who advances the env to its next subtask: `TaskConfig.advance`."""
         return advance_of(self.termination)
 
 
 def advance_of(termination: str) -> str:
-    """Return who takes the env to its next subtask where subtasks end so: `TaskConfig.advance`."""
+    """Return who advances the env to its next subtask (`TaskConfig.advance`) for a termination."""
     return "told" if termination == "learned" else "success"
 
 

@@ -7,15 +7,15 @@ Interface:
 * `read(folder, task) -> LeRobotCheckpoint`: what the policy was trained for and what it sees.
 * `LeRobotAgent`: the policy as an agent.
 
-A policy of seven actions moves the active arm by increments and sees its pose. One of sixteen says
-both arms' set-points and sees both (`envs.absolute`), as policies trained on datasets of layout
-"open-h" or on the field's own do; of images it may then see those by their names there
+A policy with seven action values moves the active arm by increments and sees its pose. One with
+sixteen outputs both arms' set-points and sees both poses (`envs.absolute`), as policies trained on
+datasets of layout "open-h" or on the field's own do. Images may have their names in those datasets
 (`dataset.open_h`).
 
 The policy runs through LeRobot's own pipeline, as in `lerobot-eval`. So that a result depends
-neither on the batch nor on the processes, every slot has a policy of its own (sharing weights) with
-its own random numbers, drawn from the episode's seed; a policy that declares itself `memoryless`
-gets all slots in one batch. Importing LeRobot takes ten seconds and happens in the worker alone.
+neither on the batch nor on the processes, every slot has its own policy (sharing weights) with its
+own random numbers, drawn from the episode's seed; a policy that declares itself `memoryless` gets
+all slots in one batch. Importing LeRobot takes ten seconds and happens only in the worker.
 """
 
 import contextlib
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
 PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")
-"""Where a checkpoint lies in a folder the user names."""
+"""Where a checkpoint may be in a folder that the user names."""
 ENV_TYPE = "surgicai"
 VISUAL = "VISUAL"
 ABSOLUTE_SIZE = len(names.ABSOLUTE_ACTION_NAMES)
@@ -105,7 +105,7 @@ class Inputs:
     Attributes:
         cameras: views.
         image_size: height and width of their images [px].
-        encoder: encoder whose features it sees in place of images; None for images.
+        encoder: encoder whose features it sees instead of images; None for images.
         sha256: hash of that encoder's weights; empty where unknown.
         image_names: what the policy calls the views' images after `observation.images.`; empty for
             the views' own names.
@@ -149,7 +149,7 @@ def read(folder: Path, task: str | None = None) -> LeRobotCheckpoint:
 
     Args:
         folder: holds config.json and model.safetensors.
-        task: the task, where the checkpoint does not say it.
+        task: the task, where the checkpoint does not name it.
 
     Raises:
         BadFile: a checkpoint that is damaged.
@@ -169,7 +169,7 @@ def _circumstances(
 ) -> tuple[TaskConfig, Inputs]:
     """Return the task the policy was trained for and what it sees.
 
-    They are told by its env, its dataset or `task`.
+    They come from its env, its dataset or `task`.
     """
     path = folder / TRAINING
     env = _part(path, training, "env")
@@ -216,7 +216,7 @@ def _circumstances(
 
 
 def _action_mode(folder: Path, seen: Mapping[str, Any], said: Mapping[str, Any]) -> str:
-    """Return what a policy's actions are, by their number; its state must have as many.
+    """Return a policy's action mode, by its number of values; its state must have as many.
 
     Raises:
         InputError: actions that our envs do not take.
@@ -295,7 +295,7 @@ def _check_features(path: Path, policy: Mapping[str, Any]) -> None:
 
 
 def _is_feature(feature: object) -> bool:
-    """Return True for a table with the type and the shape of a feature, three sizes of an image."""
+    """Return True for a table with a feature's type and shape; an image's shape has three sizes."""
     if not isinstance(feature, dict) or not isinstance(feature.get("type"), str):
         return False
     shape = feature.get("shape")
@@ -324,10 +324,10 @@ class LeRobotAgent(Agent):
     """A policy of LeRobot.
 
     Args:
-        name: how tables call it.
+        name: its name in tables.
         folder: its checkpoint.
         inputs: what it sees.
-        text: the task in words, as its dataset says it.
+        text: the task in words, as in its dataset.
         weights: where pretrained weights come from.
     """
 
@@ -343,7 +343,7 @@ class LeRobotAgent(Agent):
         self.cameras = inputs.cameras
         self.image_size = inputs.image_size
         self.action_mode = inputs.action_mode
-        # Both arms' poses are asked of the env itself (`_state`); no driver tells them yet.
+        # Both arms' poses are read from the env itself (`_state`); no driver provides them yet.
         self.privileged = inputs.action_mode == names.ABSOLUTE
         self._shown = inputs.shown
         self._policy, self._before, self._after = _load(folder, weights)
@@ -354,7 +354,7 @@ class LeRobotAgent(Agent):
         self._slots: dict[int, tuple[LeRobotPolicy, dict[str, torch.Tensor]]] = {}
 
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
-        """Give the slot a policy that remembers nothing, and the random numbers of its seed."""
+        """Give the slot a policy that remembers nothing, and the random numbers of `seed`."""
         policy = self._policy
         if not self._together:
             tensors = itertools.chain(policy.parameters(), policy.buffers())
@@ -363,7 +363,7 @@ class LeRobotAgent(Agent):
         self._slots[slot] = policy, seeded_random_states(self._device, seed)
 
     def restart(self, slot: int) -> None:
-        """Forget what the slot's policy has planned: its subtask begins anew."""
+        """Forget what the slot's policy has planned: a subtask begins."""
         self._slots[slot][0].reset()
 
     def act(
@@ -387,7 +387,7 @@ class LeRobotAgent(Agent):
     def _state(self, robots: Sequence[Robot]) -> NDArray[np.float32]:
         """Return what the policy sees of the arms, (n, 7) or (n, 16).
 
-        Asked of the robot: another arm may have become active since it was observed.
+        It is read from the robot: another arm may have become active since the observation.
         """
         if self.action_mode == names.ABSOLUTE:
             return np.stack([simulated(robot).absolute_pos() for robot in robots])

@@ -1,4 +1,4 @@
-"""Metrics: what is kept of one episode, and the summary of many.
+"""Metrics: the record of one episode, and the summary of many.
 
 `docs/evaluation.md` explains every column.
 
@@ -41,7 +41,7 @@ MEASURED = (
     "false_ends",
     "end_delay_s",
 )
-"""Columns a summary gives mean, deviation and median of, over all episodes that have them."""
+"""Columns that a summary gives as mean, deviation and median, over all episodes that have them."""
 
 
 @dataclass(frozen=True)
@@ -50,39 +50,40 @@ class EpisodeMetrics:
 
     Attributes:
         task: one of `tasks.task_names()`.
-        policy: how tables call who acted.
+        policy: name of the policy in tables.
         seed: seed of the start.
         success: whether the task succeeded; never with an error.
         steps: control steps of 20 ms taken.
         trajectory_length_mm: path of the measured active tip, Σ‖Δxyz‖ [mm].
         d_trans_mm: last distance to the goal [mm]; NaN where nothing was measured.
         d_angle_deg: last angle to the goal [deg].
-        contact: whether the active jaws felt the needle at the end.
-        error: what broke the episode off, or "".
+        contact: whether the active jaws touched the needle at the end.
+        error: what aborted the episode, or "".
         grasp: grasp level of the scene.
         failure: "" for a success, else one of `KINDS`.
-        stages: subtasks that succeeded in their order, of the whole procedure; 1 for a subtask's
-            own success.
-        entry_mm: where the tip went in, from the entry's mark [mm]; NaN where it did not.
-        exit_mm: where it came out, from the exit's mark [mm].
+        stages: subtasks of the whole procedure that succeeded in order; 1 for the success of a
+            single subtask.
+        entry_mm: distance from the entry's mark to where the tip went in [mm]; NaN where it did
+            not.
+        exit_mm: distance from the exit's mark to where it came out [mm].
         slip_mm: the needle's largest shift in the active jaws since they took it [mm].
-        slip_deg: its largest turn [deg].
+        slip_deg: the needle's largest rotation there [deg].
         tissue_force_n: largest net force of needle and instruments on the tissue [N].
         bite_depth_mm: how deep the tip went under the straight line from entry to exit [mm].
-        bite_length_mm: straight from entry to exit [mm].
-        entry_deg: needle to the skin's normal where the tip went in [deg].
+        bite_length_mm: straight distance from entry to exit [mm].
+        entry_deg: angle of the needle to the skin's normal where the tip went in [deg].
         exit_deg: the same where it came out.
-        tissue_impulse_ns: that force summed over time [N s].
+        tissue_impulse_ns: the force on the tissue summed over time [N s].
         tears: how often the tissue tore; NaN where it cannot.
         thread_mm: thread drawn out of the exit [mm]; NaN without a thread.
-        paper_success: whether the paper's own success was reached.
+        paper_success: whether the paper's own success criterion was met.
         upset: what went wrong, one of `envs.upset.KINDS`; "" where nothing did.
-        upset_step: control steps taken when it did; -1 where nothing did.
-        recovered: something went wrong, and the task succeeded all the same.
-        false_ends: of the whole procedure, subtasks that were ended before their success was
+        upset_step: control steps taken when it went wrong; -1 where nothing did.
+        recovered: something went wrong, and the task still succeeded.
+        false_ends: subtasks of the whole procedure that were ended before their success was
             measured (`envs.visits`); NaN for another task.
-        end_delay_s: median time from a subtask's measured success to its end [s]; NaN where none
-            was ended after it.
+        end_delay_s: median time from a subtask's measured success to its end [s]; NaN where no
+            subtask was ended after its success.
     """
 
     task: str
@@ -119,12 +120,12 @@ class EpisodeMetrics:
 
 
 def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, held: bool) -> str:
-    """Name why an episode failed: the first that holds.
+    """Name why an episode failed: the first kind that applies.
 
     Args:
-        error: what broke the episode off, or "".
-        diverged: the physics broke it off: "physics"; any other error: "error".
-        touched: whether the active jaws ever felt the needle; if not: "missed".
+        error: what aborted the episode, or "".
+        diverged: whether the physics aborted it: "physics"; any other error: "error".
+        touched: whether the active jaws ever touched the needle; if not: "missed".
         wrong_hole: the needle went through another opening than the stitch's, and stayed wrong:
             "wrong_hole".
         held: whether either arm held the needle at the end: "time" if one did, else "dropped".
@@ -139,10 +140,10 @@ def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, he
 
 
 def summary(rows: Sequence[EpisodeMetrics]) -> dict[str, Any]:
-    """Return the counts of one policy on one task.
+    """Return the summary of one policy on one task.
 
-    Trajectory length and steps are those of successful episodes; what was measured is summed up,
-    as mean, deviation and median, over all episodes that have it ("n" of them).
+    Trajectory length and steps are averaged over the successful episodes. Each measured column is
+    summarised by mean, deviation and median over all episodes that have it ("n" of them).
     """
     first, successes = rows[0], [row for row in rows if row.success]
     failures = [row.failure for row in rows if not row.success]

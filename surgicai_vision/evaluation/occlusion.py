@@ -3,13 +3,13 @@
     found = occlusion(agent, config, seed=20000, steps=(0, 20, 40), patch=32)
     found.sheet("title")           # a matplotlib figure: each image, and what mattered in it
 
-A policy acts in one episode. At the chosen steps a square of one image at a time is hidden behind
-the image's mean colour, and what counts is how far the action then is from the one without it
-(Zeiler and Fergus, ECCV 2014): the Euclidean distance in units of an action's range. Squares lie
-half a side apart; a pixel's sensitivity is the mean over the squares that hide it.
+A policy acts in one episode. At the chosen steps, one square of one image at a time is covered with
+the image's mean colour. The measure is how far this moves the action (Zeiler and Fergus, ECCV
+2014): the Euclidean distance in units of an action's range. Squares lie half a side apart; a
+pixel's sensitivity is the mean over the squares that hide it.
 
-Each question is put to a slot of its own that has seen everything the acting one has, so a policy
-that remembers answers as it would then.
+Each covered image is shown to a separate slot that has seen everything the acting one has, so a
+policy with memory answers as it would in the episode.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ Image = NDArray[np.uint8]
 HOT = (255.0, 32.0, 0.0)
 """Colour of what matters [grey levels of 255]."""
 COVER = 0.75
-"""Opacity of it where it matters most on a sheet."""
+"""Opacity of that colour on a sheet where the change is largest."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Occlusion:
     """The images of one episode at the chosen steps, and how it ended.
 
     Attributes:
-        found: step after step, in each all views.
+        found: the images step by step, all views of each step.
         success: whether the episode succeeded.
         steps: control steps it took.
     """
@@ -75,7 +75,7 @@ class Occlusion:
         return max(float(one.change.max()) for one in self.found)
 
     def sheet(self, title: str) -> "Figure":
-        """Return a grid: a row a step; of each view the image, and beside it what mattered."""
+        """Return a grid with one row per step: each view's image and, next to it, what mattered."""
         rows = []
         views = list(dict.fromkeys(one.view for one in self.found))
         for step in dict.fromkeys(one.step for one in self.found):
@@ -113,7 +113,7 @@ def occlusion(
 
     Raises:
         InputError: a policy without images or of the whole procedure, no step within the episode,
-            or a square that is no part of the image.
+            or a square that does not fit into the image.
     """
     _check(agent, config, steps, patch)
     env = env_of(agent, config)
@@ -155,7 +155,7 @@ def occlusion(
 
 
 def _check(agent: Agent, config: TaskConfig, steps: Sequence[int], patch: int) -> None:
-    """Refuse what cannot be asked."""
+    """Refuse policies, steps and squares that give no result."""
     if not agent.cameras or agent.depth:
         raise InputError(f"{agent.name} sees no images in colour; give a policy that does.")
     if config.task == names.SUTURE:
@@ -190,7 +190,7 @@ def spread(
 
 
 def _drawn(observation: Observation) -> Mapping[str, Frame]:
-    """Return an observation with its images drawn."""
+    """Return an observation with its images rendered."""
     assert isinstance(observation, Mapping)  # the agent sees images
     return {key: observation[key] for key in observation}
 
@@ -198,7 +198,7 @@ def _drawn(observation: Observation) -> Mapping[str, Frame]:
 def _without(
     seen: Mapping[str, Frame], view: str, place: tuple[slice, slice]
 ) -> Mapping[str, Frame]:
-    """Return an observation with a square of one view hidden behind its mean colour."""
+    """Return an observation with a square of one view covered with the view's mean colour."""
     image = seen[view].astype(np.uint8)
     image[place] = np.rint(image.mean(axis=(0, 1))).astype(np.uint8)
     return {**seen, view: image}

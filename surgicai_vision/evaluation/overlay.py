@@ -1,4 +1,4 @@
-"""Overlay: one image of a video: the views side by side, and below them what is measured.
+"""Overlay: compose one image of a video, the views side by side above what is measured.
 
     ┌────────────┬────────────┐
     │ front      │ back       │
@@ -7,7 +7,7 @@
     │ insert, 3 of 5 __╱╲  N  │   force on the tissue over the whole episode, as far as it has run
     └─────────────────────────┘
 
-Letters are DejaVu's, which matplotlib brings along: the same on every machine.
+The font is DejaVu, which comes with matplotlib, so text looks the same on every machine.
 """
 
 import functools
@@ -51,7 +51,7 @@ TEXT_SHARE: Final = 0.44
 """Share of the overlay's width that the text takes."""
 LEAST_MM: Final = 5.0
 LEAST_N: Final = 0.5
-"""Range of the curves [mm, N] where an episode stays below it."""
+"""Smallest range of the curves [mm, N], where an episode stays below it."""
 
 
 class Overlay:
@@ -150,7 +150,7 @@ class Overlay:
             x = left + (right - left) * steps / max(1, len(values) - 1)
             share = np.clip(np.nan_to_num(values[: index + 1]) / top, 0.0, 1.0)
             y = low - (low - high) * share
-            # Sixteenths of a pixel, as `shift` says.
+            # In sixteenths of a pixel, as `shift` requires.
             points = np.stack([x, y], axis=1) * 16
             line = [points.round().astype(np.int32)]
             cv2.polylines(canvas, line, False, colour, 1, cv2.LINE_AA, shift=4)
@@ -159,7 +159,7 @@ class Overlay:
 
 
 def _subtask_text(moment: Moment, task: str) -> str:
-    """Return the subtask that is on, in the whole procedure with its number."""
+    """Return the current subtask; in the whole procedure, with its number."""
     if task != names.SUTURE:
         return moment.subtask
     number = names.SUBTASKS.index(moment.subtask) + 1
@@ -175,7 +175,7 @@ def _caption(pen: ImageDraw.ImageDraw, x: int, y: int, text: str) -> None:
 
 
 def _fitting(text: str, size: int, room: int, *, bold: bool = False) -> str:
-    """Return a text, cut where it is wider than `room` pixels."""
+    """Return a text, cut if it is wider than `room` pixels."""
     font = _font(size, bold=bold)
     if font.getlength(text) <= room:
         return text
@@ -205,7 +205,7 @@ def video_frames(
         config: the task.
         states: for the env's `set_state_vector`, from the start on.
         moments: what was measured at each of them.
-        title: what stands above the overlay.
+        title: first line of the overlay's text.
         outcome: how the episode ended, shown at the end for `LAST_S`.
         look: views, size and pace.
     """

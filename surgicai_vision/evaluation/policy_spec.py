@@ -75,8 +75,8 @@ class PolicySpec:
     Attributes:
         run: what it is, as data; `run.env` is the task.
         make: makes the agent in a worker process.
-        about: more to be kept beside the result: hashes and folders.
-        training: what tells it from others of its name in the names of folders: its training seed,
+        about: what else is stored with the result: hashes and folders.
+        training: what distinguishes it from others of its name in folder names: its training seed,
             or the beginning of a hash where that is not known; empty where there are no others.
     """
 
@@ -87,7 +87,7 @@ class PolicySpec:
 
     @property
     def name(self) -> str:
-        """How tables call it."""
+        """Its name in tables."""
         return self.run.name
 
     @property
@@ -97,7 +97,7 @@ class PolicySpec:
 
     @property
     def folder_name(self) -> str:
-        """How folders call what is evaluated: its task, name, training and, if not plain, env."""
+        """Name for folders of what is evaluated: task, name, training and, if not plain, env."""
         parts = [self.config.task, self.name]
         if self.training and not self.name.endswith(f"-{self.training}"):
             parts.append(self.training)
@@ -107,12 +107,12 @@ class PolicySpec:
 
     @property
     def content(self) -> dict[str, JSON]:
-        """The hashes of what acts, by `CONTENT`: another training has others in the same folder."""
+        """Hashes of what acts, by `CONTENT`; another training in the same folder has others."""
         return {key: self.about[key] for key in CONTENT if key in self.about}
 
     @property
     def make_agent(self) -> MakeAgent:
-        """Makes the agent, called as tables call it."""
+        """Makes the agent, with its name in tables."""
         return functools.partial(_named, self.make, self.name)
 
 
@@ -142,13 +142,13 @@ def open_policy(
         env: fields of `TaskConfig` that differ from the default's; None keeps the env a policy was
             trained in.
         dataset: whose mean demonstration "replay" plays.
-        expert_swap: the subtask of a hierarchical policy that the expert does in its place.
+        expert_swap: the subtask of a hierarchical policy that the expert does instead.
         weights: where pretrained weights come from.
-        changes: `KEY=VALUE` of `ACTED_BY`, by which a checkpoint of ours that plans chunks acts in
-            the place of its recipe's.
+        changes: `KEY=VALUE` of `ACTED_BY` that replace the recipe's, for a checkpoint of ours that
+            plans chunks.
 
     Raises:
-        UnknownName: a name that stands for nothing.
+        UnknownName: a name that is not known.
         BadFile: a folder or file that is no policy.
         InputError: a policy of another task, or an option that does not go with this policy.
         MissingWeights: an encoder's weights are not at hand.
@@ -192,7 +192,7 @@ def open_policy(
 
 
 def _task_of_baseline(name: str, task: str | None) -> str:
-    """Return the task of a baseline; the expert that goes back acts in whole procedures alone."""
+    """Return the task of a baseline; the expert that goes back acts only in whole procedures."""
     if name != RECOVER:
         return task or "grasp"
     if task not in (None, names.SUTURE):
@@ -209,7 +209,7 @@ def _names_code(text: str) -> bool:
 
 
 def in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
-    """Put what is evaluated into the env of the table `env`, where there is one.
+    """Return what is evaluated, in the env of the table `env` if one is given.
 
     Args:
         spec: what is evaluated.
@@ -235,7 +235,7 @@ def _replay(dataset: "Dataset") -> PolicySpec:
     """Return the mean demonstration of an opened dataset.
 
     Raises:
-        InputError: a dataset without every step's frame.
+        InputError: a dataset without a frame of every step.
     """
     if dataset.fps != names.FPS:
         raise InputError(
@@ -250,7 +250,7 @@ def _replay(dataset: "Dataset") -> PolicySpec:
 
 
 def _from_factory(target: str, config: TaskConfig) -> PolicySpec:
-    """Return what a function elsewhere makes: "module:factory", called in each worker process."""
+    """Return the policy of a function "module:factory", called in each worker process."""
     agent = make_from_factory(target)
     encoder = OWN if agent.cameras else None
     run = RunConfig(config, encoder, agent.cameras, policy=target)
@@ -270,13 +270,13 @@ def make_from_factory(target: str) -> Agent:
         factory = resolve(target)
     except (ImportError, AttributeError) as error:
         raise InputError(f"{target} cannot be imported: {error}; give module:factory.") from error
-    except Exception as error:  # a module of others, whose import may raise anything
+    except Exception as error:  # third-party code, whose import may raise anything
         raise _failed(target, error) from error
     try:
         agent = factory() if callable(factory) else factory
     except SurgicaiError:
         raise
-    except Exception as error:  # code of others, which may raise anything
+    except Exception as error:  # third-party code, which may raise anything
         raise _failed(target, error) from error
     if not isinstance(agent, Agent):
         raise InputError(
@@ -287,7 +287,7 @@ def make_from_factory(target: str) -> Agent:
 
 
 def _failed(target: str, error: Exception) -> InputError:
-    """Return the error about a factory, or the import of its module, that raised one."""
+    """Return the error for a factory, or the import of its module, that raised one."""
     return InputError(
         f"{target} fails with {type(error).__name__} ({first_line(error)}); give a function "
         "that takes no arguments and returns a surgicai_vision.evaluation.agent.Agent."
@@ -319,7 +319,7 @@ def _from_checkpoint(folder: Path, weights: WeightsSource, changes: tuple[str, .
 
     Raises:
         BadFile: no checkpoint folder, or one without the policy whose progress it is fed.
-        UnknownName: a change of what does not decide how it acts.
+        UnknownName: a change of a setting that does not decide how it acts.
         InputError: a high-level policy, or a change that is not allowed.
         MissingWeights: the encoder's weights are not at hand.
     """
@@ -347,7 +347,7 @@ def _from_checkpoint(folder: Path, weights: WeightsSource, changes: tuple[str, .
 
 
 def _hashes(checkpoint: Checkpoint) -> dict[str, JSON]:
-    """Return what tells a checkpoint of ours from another one in the same folder."""
+    """Return what distinguishes a checkpoint of ours from another one in the same folder."""
     encoder = checkpoint.encoder
     return {
         "weights_sha256": encoder.weights_sha256 if encoder else None,
@@ -366,7 +366,7 @@ def acting_agent(
     Args:
         folder: the checkpoint.
         weights: where pretrained weights come from.
-        changes: settings by which it acts in the place of its own (`policies.restore`).
+        changes: settings by which it acts instead of its own (`policies.restore`).
 
     Raises:
         InputError: the encoder at hand is not the one the policy was trained on.
@@ -406,7 +406,7 @@ def _agent_of(policy: "Policy", weights: WeightsSource) -> PolicyAgent:
 def _common_env(trained_in: Iterable[TaskConfig]) -> TaskConfig:
     """Return the env that policies have in common, whatever their tasks.
 
-    What varies from episode to episode may have differed in their trainings; then nothing varies.
+    If what varies between episodes differed in their trainings, nothing varies.
 
     Raises:
         InputError: they were trained in different scenes or with different steps.
@@ -435,14 +435,14 @@ def hierarchical_policy(
 
     Args:
         config: who decides and who acts.
-        expert_swap: the subtask that the expert does in the place of its policy.
+        expert_swap: the subtask that the expert does instead of its policy.
         weights: where pretrained weights come from.
 
     Raises:
         BadFile: a folder that is no checkpoint.
         InputError: a policy of another subtask or scene than it is to act in.
     """
-    # With experts in every place a policy knows no scene: the task is that of all its policies.
+    # The env is the one that the trained policies have in common; experts belong to no scene.
     known: dict[str, RunConfig] = {}
     low: dict[str, MakeAgent] = {}
     parts: dict[str, JSON] = {}

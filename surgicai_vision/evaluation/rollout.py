@@ -1,7 +1,7 @@
-"""Evaluation: an agent × a task × start seeds → one row an episode.
+"""Evaluation: an agent × a task × start seeds → one row per episode.
 
 Episodes run in lock step in `batch` slots, so that an encoder sees many frames at once; a slot
-whose episode ends takes the next seed. Seeds are shared out over spawned processes. The result
+whose episode ends takes the next seed. Seeds are distributed over spawned processes. The result
 depends on neither: every episode has its own state and random numbers, and encoders and policies
 give a row the same answer in any batch.
 
@@ -23,7 +23,7 @@ from surgicai_vision.evaluation.films import Filming
 from surgicai_vision.evaluation.slot import Episode, Slot
 
 BATCH = 8
-"""Slots of a process: what an encoder computes at once (`encoders.base`)."""
+"""Slots per process, whose images an encoder computes at once (`encoders.base`)."""
 
 
 def check_seeds(seeds: Sequence[int]) -> None:
@@ -32,7 +32,7 @@ def check_seeds(seeds: Sequence[int]) -> None:
     Raises:
         InputError: no seeds, repeated seeds, or one that is too large or negative.
     """
-    # A range is ordered, and may be far too long to be counted.
+    # A range is ordered, and may be far too long to iterate over.
     ends = (seeds[0], seeds[-1]) if isinstance(seeds, range) and seeds else seeds
     if any(not 0 <= seed <= LARGEST_INTEGER for seed in ends):
         raise InputError(
@@ -61,9 +61,9 @@ def evaluate(
         make_agent: makes the agent, once in each process.
         task_config: the task.
         seeds: start states, each once.
-        batch: slots of a process, at least 1.
-        workers: processes; None takes one for each core and for each 4 seeds.
-        progress: called as progress(steps done, steps at most).
+        batch: slots per process, at least 1.
+        workers: processes; None takes one per 4 seeds, but no more than there are cores.
+        progress: called as progress(steps done, most steps there can be).
         filming: which episodes become videos, written by the process that ran them; None films
             nothing.
         upset: let one thing go wrong in every episode (`envs.upset`), drawn from its seed.
@@ -112,7 +112,7 @@ def run_share(
 ) -> list[Episode]:
     """Run the episodes of one process.
 
-    `report` is told the steps done; a finished episode counts as all of its own.
+    `report` is called with the steps done; a finished episode counts as its full step limit.
     """
     agent = make_agent()
     slots = [
@@ -150,7 +150,7 @@ def run_share(
 def _in_processes(
     shares: Sequence[Callable[..., list[Episode]]], progress: Progress | None, total: int
 ) -> list[list[Episode]]:
-    """Run shares in processes of their own."""
+    """Run each share in its own process."""
     try:
         return processes.run_all(
             shares,

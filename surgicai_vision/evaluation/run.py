@@ -48,9 +48,9 @@ def evaluate_into(
     Args:
         out: folder for rows, films and summary.
         spec: what is evaluated.
-        seeds: start seeds, in a row.
+        seeds: consecutive start seeds.
         workers: processes.
-        progress: called as progress(steps done, steps at most).
+        progress: called as progress(steps done, most steps there can be).
         filming: which episodes become videos; None films nothing.
 
     Raises:

@@ -1,7 +1,7 @@
 """Slot: one env and the episode of an agent that runs in it.
 
-`evaluation.rollout` runs several at once; `evaluation.watch` runs one that a person looks at. Both
-take the same steps, so what is watched is what is counted.
+`evaluation.rollout` runs several at once; `evaluation.watch` runs one for a person to watch. Both
+take the same steps, so what a person watches is what an evaluation measures.
 
     slot = Slot(0, agent, config)
     slot.begin(seed)
@@ -53,7 +53,7 @@ class Episode:
 
 
 def env_of(agent: Agent, config: TaskConfig) -> Env:
-    """Make an env that shows what the agent sees, and renders what it looks at."""
+    """Make an env that shows what the agent sees, and renders an image only when it is accessed."""
     cameras = tuple(agent.cameras)
     env = envs.make(
         config,
@@ -161,7 +161,7 @@ class Slot:
             self._keep()
 
     def _let_happen(self) -> None:
-        """Let go wrong what is due now, and look again where the needle was pushed."""
+        """Let an upset that is due happen, and observe again if it pushed the needle."""
         if self._mishap.before_step():
             self.observation = self.env.observe()
 
@@ -173,7 +173,7 @@ class Slot:
         monitor = self.monitor
         bite = monitor.bite
         held = not self.error and monitor.is_held()
-        # After a start that could not be made the watch still holds the episode before.
+        # If the start could not be made, the watch still holds the episode before.
         watch = self.watch if self._has_begun else None
         visits = watch.visits() if watch else ()
         delays = [visit.delay for visit in visits if visit.delay is not None]

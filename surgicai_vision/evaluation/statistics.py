@@ -79,13 +79,13 @@ def hierarchical_bootstrap(
 
     * successes (values 0 and 1): Korn and Graubard, Survey Methodology 24 (1998). The episodes are
       worth n* = min(n, p(1-p)/e²) · (t(n-1)/t(m-1))² independent ones, t(d) being Student's
-      quantile for d degrees of freedom, n episodes and m seeds in all; Clopper and Pearson's bounds
-      of n* trials follow;
-    * other values: mean ± t(m-1) e √(m/(m-1)), the factor since m drawn seeds scatter by (m-1)/m
-      too little.
+      quantile for d degrees of freedom, n episodes and m seeds in all; the interval is Clopper and
+      Pearson's for n* trials;
+    * other values: mean ± t(m-1) e √(m/(m-1)); the factor is there because m drawn seeds scatter by
+      (m-1)/m too little.
 
-    One seed says nothing about others: its interval is that of its own episodes. Coverage:
-    `benchmarks/coverage.py`.
+    A single seed says nothing about others: its interval is that of its own episodes.
+    `benchmarks/coverage.py` measures the coverage.
 
     Args:
         groups: for each training seed its episodes' values; seeds may differ in their number of
@@ -112,7 +112,7 @@ def hierarchical_bootstrap(
     rates, single = all(np.isin(seed, (0.0, 1.0)).all() for seed in seeds), len(seeds) == 1
     if rates and single:
         return _beta_bounds(float(seeds[0].sum()), seeds[0].size, level)
-    # Of one seed the episodes are what is independent.
+    # With one seed, its episodes are the independent units.
     units = [seeds[0][[episode]] for episode in range(seeds[0].size)] if single else seeds
     mean, error = (
         float(np.mean([unit.mean() for unit in units])),
@@ -153,9 +153,9 @@ def _student(level: float, freedom: int) -> float:
 def mcnemar(one: ArrayLike, other: ArrayLike) -> float:
     """Return the exact two-sided p-value of two policies' successes on the same starts.
 
-    McNemar, Psychometrika 12 (1947), exact: of the starts that only one of them solves, each has as
-    many as a fair coin would give; p is twice the smaller binomial tail, at most 1. Starts that
-    both or neither solve say nothing.
+    McNemar, Psychometrika 12 (1947), exact: under the null hypothesis, a fair coin decides which
+    policy solves a start that only one of them solves. p is twice the smaller binomial tail, at
+    most 1. Starts that both or neither solve carry no information.
 
     Args:
         one: successes of the first policy, booleans (n,).
@@ -241,7 +241,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
     Holm, Scandinavian Journal of Statistics 6 (1979): the i-th smallest of m is multiplied by m - i
     + 1, is at least as large as the one before, and at most 1. Rejecting those below α keeps the
-    chance of any false one below α.
+    chance of any false rejection below α.
 
     Raises:
         InputError: a p-value outside [0, 1].
@@ -279,11 +279,11 @@ def area_under_curve(strength: ArrayLike, success: ArrayLike) -> float:
 def area_interval(areas: Sequence[float], level: float = 0.95) -> tuple[float, float]:
     """Return an interval of the mean of values in [0, 1].
 
-    Each start's own area under its successes.
+    The values are each start's own area under its successes.
 
-    A value in [0, 1] varies at most as much as a success of the same mean, so that Clopper and
-    Pearson's bounds of their sum (which need not be whole) out of their number are at least as wide
-    as they must be.
+    A value in [0, 1] varies at most as much as a success of the same mean. Clopper and Pearson's
+    bounds of their sum (which need not be an integer) out of their number are therefore at least as
+    wide as they must be.
 
     Raises:
         InputError: no values, or one outside [0, 1].

@@ -1,8 +1,8 @@
 """Results: an evaluation as a folder, for reports and for anyone's own analysis.
 
-`evaluation.json` (written last: it marks a whole folder) holds the run, the summary and how it was
-made, `episodes.parquet` one row an episode, `films.safetensors` a few states of each episode. Of a
-whole procedure `visits.parquet` has one row a visit of a subtask (`envs.visits`).
+`evaluation.json` (written last, so it marks a complete folder) holds the run, the summary and how
+it was made. `episodes.parquet` has one row per episode, `films.safetensors` a few states of each
+episode. For a whole procedure, `visits.parquet` has one row per visit of a subtask (`envs.visits`).
 """
 
 import dataclasses
@@ -38,13 +38,13 @@ VISITS = "visits.parquet"
 LOCK = "evaluation.lock"
 """Held while a process evaluates into the folder."""
 OURS = (MARKER, EPISODES, FILMS, VISITS, LOCK)
-"""Every file of an evaluation; a killed one leaves some of them without the marker."""
+"""Every file of an evaluation; a killed evaluation leaves some of them without the marker."""
 RUN_FILE = "run.json"
 GRID_FILE = "sweep.json"
 RESULT_FILE = "result.json"
 FAILED_FILE = "failed.json"
 FORMAT = 2
-"""Version of what evaluations, sweeps and quickstarts store; 0.1 wrote none."""
+"""Version of the files that evaluations, sweeps and quickstarts store; 0.1 wrote none."""
 
 Row = dict[str, Any]
 """A row of a table, or a summary: plain data."""
@@ -56,8 +56,8 @@ class Evaluation:
 
     Attributes:
         run: what was evaluated.
-        summary: its counts.
-        about: with what, where and by which command.
+        summary: its summary, such as the number of successes.
+        about: with what, where and by which command it was made.
     """
 
     run: RunConfig
@@ -100,14 +100,14 @@ def read_evaluation(folder: Path) -> Evaluation:
 
 
 def _check_summary(summary: Row, where: str) -> None:
-    """Refuse a summary without what reports read of it."""
+    """Refuse a summary that lacks what reports read from it."""
     checked(summary.get("successes"), int, f"{where}: successes")
     for key in ("task", "policy"):
         checked(summary.get(key), str, f"{where}: {key}")
 
 
 def _check_about(about: Row, where: str) -> None:
-    """Refuse tables and texts of another type; each may be absent or null."""
+    """Refuse tables and texts of the wrong type; each may be absent or null."""
     checked(about.get("checkpoint") or {}, dict, f"{where}: checkpoint")
     if about.get("high_level"):
         high_level = checked(about["high_level"], dict, f"{where}: high_level")
@@ -119,7 +119,7 @@ def _check_about(about: Row, where: str) -> None:
 
 
 def check_provenance(value: object, where: str) -> None:
-    """Refuse what is no table of a machine and its packages (`evaluation.provenance`).
+    """Refuse a value that is no table of a machine and its packages (`evaluation.provenance`).
 
     Raises:
         BadFile: it is of another type.
@@ -130,7 +130,7 @@ def check_provenance(value: object, where: str) -> None:
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Hold a folder that is evaluated into; it is made, and removed again if nothing came into it.
+    """Lock a folder that is evaluated into; it is made, and removed again if it stays empty.
 
     Raises:
         InputError: another process evaluates into it.
@@ -209,7 +209,7 @@ def parquet_bytes(table: list[Row]) -> bytes:
 
 
 def read_rows(folder: Path) -> list[Row]:
-    """Return the rows of an evaluation, one dictionary an episode.
+    """Return the rows of an evaluation, one dictionary per episode.
 
     Raises:
         BadFile: there is none, or it is damaged.
@@ -220,7 +220,7 @@ def read_rows(folder: Path) -> list[Row]:
     rows = read_parquet(path)
     if not rows:
         raise BadFile(f"{path} is damaged (no episodes); evaluate again.")
-    # A column of whole numbers alone comes back as integers, whatever its field is.
+    # A column with only whole numbers comes back as integers, even if its field is a float.
     kinds = {
         name: int | float if kind is float else kind
         for name, kind in get_type_hints(EpisodeMetrics).items()
@@ -230,7 +230,7 @@ def read_rows(folder: Path) -> list[Row]:
         for field in dataclasses.fields(EpisodeMetrics)
         if field.name in rows[0] or field.default is dataclasses.MISSING
     ]
-    for field in needed:  # those that came later, and have a default, may be absent
+    for field in needed:  # fields added later have a default and may be absent
         if not all(isinstance(row.get(field.name), kinds[field.name]) for row in rows):
             raise BadFile(
                 f"{path} is damaged (column {field.name} is missing or of another type); "
@@ -253,7 +253,7 @@ def read_parquet(path: Path) -> list[Row]:
 
     try:
         rows: list[Row] = pq.read_table(path).to_pylist()
-    except (pa.ArrowException, OSError, ValueError) as error:  # the last of texts that are none
+    except (pa.ArrowException, OSError, ValueError) as error:  # the last: undecodable text
         raise BadFile(f"{path} is damaged ({first_line(error)}); make it again.") from None
     return rows
 
@@ -280,5 +280,5 @@ def read_film(folder: Path, seed: int) -> Film:
 
 
 def find_evaluations(folder: Path) -> list[Path]:
-    """Return the folders of all whole evaluations below `folder`, in the order of their names."""
+    """Return the folders of all complete evaluations below `folder`, in the order of names."""
     return sorted(path.parent for path in folder.rglob(MARKER) if files.TEMPORARY not in str(path))

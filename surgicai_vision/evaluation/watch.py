@@ -4,8 +4,8 @@
     with LivePage("…", camera_names(), controls=True) as page:
         watch_on_page(player, page, LiveViews(player.env, ("front", "back"), 448))
 
-The player takes the steps of `evaluation.slot`, as an evaluation does: what is watched is what is
-counted. It has no clock; the loops below keep the time.
+The player steps an `evaluation.slot`, as an evaluation does, so what a person watches is what an
+evaluation measures. It has no clock; the loops below keep the time.
 
     playing ◄─pause, play─► paused        step: one control step, then paused
        └──────── ended ◄──────┘           next, play: the next start; again: the same one
@@ -36,24 +36,24 @@ from surgicai_vision.evaluation.metrics import EpisodeMetrics
 from surgicai_vision.evaluation.slot import Slot
 
 REST_TICKS = 75
-"""Ticks for which an ended episode stands before the next start begins by itself: 1.5 s."""
+"""Ticks for which an ended episode stays before the next start begins by itself: 1.5 s."""
 PATIENCE = 3
-"""Ticks after which an image is due: a policy that encodes images is slower than real time."""
+"""Ticks after which an image is due, even if late: policies that encode images are slow."""
 NOTHING = Moment(0, "", "", 0.0, 0.0, False, 0.0, 0, False)
 """What is measured where a start could not be made."""
 
 Told = Callable[[EpisodeMetrics], None]
-"""Is told of every episode that has ended."""
+"""Called with the row of every episode that has ended."""
 
 
 class Curves(Protocol):
-    """Takes what is drawn over an episode; a `LivePage` does."""
+    """Receives what is plotted over an episode, as a `LivePage` does."""
 
     def begin(self, episode: int) -> None:
         """Begin another episode."""
 
     def add_point(self, distance: float, force: float) -> None:
-        """Take the distance to the goal [m] and the force on the tissue [N] of one moment."""
+        """Add the distance to the goal [m] and the force on the tissue [N] of one moment."""
 
 
 @final
@@ -64,11 +64,11 @@ class Player:
         agent: what acts.
         config: the task.
         seed: of the first start; the next ones follow.
-        episodes: stop when so many have ended; None goes on until "stop".
+        episodes: stop when this many have ended; None goes on until "stop".
         go_on: the next start begins by itself.
         playing: begin to play at once.
-        curves: takes every moment's measures.
-        told: is told of every episode that has ended.
+        curves: receives what is measured at every moment.
+        told: called with the row of every episode that has ended.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Player:
 
     @property
     def over(self) -> bool:
-        """Return True if the player was stopped, or has played all it was to play."""
+        """Return True if the player was stopped, or has played all its episodes."""
         return self.state == STOPPED
 
     @property
@@ -112,7 +112,7 @@ class Player:
         return self._slot.moments[-1] if self._slot.moments else NOTHING
 
     def handle(self, command: Command) -> None:
-        """Follow one of `PLAY_COMMANDS`."""
+        """Carry out one of `PLAY_COMMANDS`."""
         if self.over:
             return
         if command.name == "play":
@@ -148,8 +148,8 @@ class Player:
         """Return what a page shows.
 
         Args:
-            views: those that are shown.
-            points: of the page's curves.
+            views: the views that are shown.
+            points: number of points of the page's curves.
             reached: share of real time at which it plays.
         """
         return LiveStatus(
@@ -199,7 +199,7 @@ class Player:
             self._curves.add_point(self.moment.distance, self.moment.force)
 
     def _end(self) -> None:
-        """Count the episode that has ended."""
+        """Record the episode that has ended."""
         self.state = ENDED
         row = self._slot.take().row
         self.rows[row.seed] = row
@@ -223,8 +223,8 @@ def watch_on_page(player: Player, page: LivePage, views: LiveViews) -> None:
     """Play on a page until the player is over.
 
     Args:
-        player: plays; the page takes its curves.
-        page: takes commands and shows images and status; it is served already.
+        player: plays; the page receives its curves.
+        page: takes commands and shows images and status; it is already being served.
         views: draws the images.
     """
     pacer = Pacer(player.speed, patience=PATIENCE)
@@ -239,7 +239,7 @@ def watch_on_page(player: Player, page: LivePage, views: LiveViews) -> None:
         player.tick()
         if page.screen.wants_image() and pacer.can_draw():
             status = player.status(views.shown, page.points, pacer.reached)
-            # Images are drawn anew only where something that they show has changed.
+            # Images are redrawn only if something that they show has changed.
             now = (player.number, status.moment.step, views.shown, views.orbit)
             if now != drawn:
                 images = views.render()

@@ -3,9 +3,9 @@
     learner = learner_of(Path("outputs/train/grasp-…"), config)
     record(config, episodes=350, demonstrator="search", learner=learner, out=Path("demos"))
 
-An episode is the learner's until a step drawn uniformly from its limit, then the expert's, who
-mends what it finds; kept is, as ever, what succeeds. Rendered together with the demonstrations the
-learner was trained on, they train the next one (`render-demos --demos A,B`).
+The learner acts until a step drawn uniformly within the episode's step limit; then the expert takes
+over and recovers. As always, only episodes that succeed are kept. Rendered together with the
+demonstrations the learner was trained on, they train the next one (`render-demos --demos A,B`).
 """
 
 import atexit
@@ -30,7 +30,7 @@ from surgicai_vision.training import released
 
 @final
 class MixturePolicy(BehaviourPolicy):
-    """An agent until a step of each episode that is drawn by chance, then the expert."""
+    """An agent until a randomly drawn step of each episode, then the expert."""
 
     def __init__(self, agent: Agent):
         self._agent = agent
@@ -83,7 +83,7 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
     packages=("mujoco", "numpy", "torch", "timm", "lerobot"),
 )
 def record_driven(folder: Path, task: Mapping[str, JSON], learner: str, **how: Any) -> None:
-    """Job "drive-episode": as "record-episode", with a learner that drives."""
+    """Job "drive-episode": as "record-episode", with a learner that acts first."""
     env, mixture = _driven(from_mapping(TaskConfig, task), learner)
     record_into(folder, env, behaviour=mixture, **how)
 
@@ -91,6 +91,6 @@ def record_driven(folder: Path, task: Mapping[str, JSON], learner: str, **how: A
 @functools.lru_cache(maxsize=1)
 def _driven(config: TaskConfig, learner: str) -> tuple[Env, MixturePolicy]:
     """Return this process's environment with what the learner sees, and the learner."""
-    atexit.register(_driven.cache_clear)  # the GL context must go before the interpreter does
+    atexit.register(_driven.cache_clear)  # the GL context must be freed before Python exits
     agent = open_policy(learner, task=config.task).make_agent()
     return env_of(agent, config), MixturePolicy(agent)

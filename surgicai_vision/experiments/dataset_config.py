@@ -1,8 +1,8 @@
-"""What a dataset consists of, as data: demonstrations, and the images rendered of them.
+"""What a dataset consists of, as data: demonstrations, and the images rendered from them.
 
-A training seed draws its own demonstrations: those of seed s are recorded at the start seeds
-`first_seed(s)`, `first_seed(s)` + 1, …, `SEEDS_EACH` at most. So training seeds share no start,
-and none meets the banks of validation and test. Training seed 0 begins at `names.TRAIN_SEED`.
+Each training seed has its own demonstrations: those of seed s are recorded at the start seeds
+`first_seed(s)`, `first_seed(s)` + 1, …, `SEEDS_EACH` at most. So training seeds share no start, and
+none uses starts of the validation and test banks. Training seed 0 begins at `names.TRAIN_SEED`.
 """
 
 from collections.abc import Mapping
@@ -20,48 +20,48 @@ SEEDS_EACH = 20_000
 TRAINING_SEEDS = 20
 """Training seeds that have start seeds of their own: the bank of training is below 400,000."""
 SEEDS_TRIED = 4
-"""Most seeds that are tried for each demonstration and for one more (`demos.record`)."""
+"""Most seeds tried per demonstration, with one demonstration added (`demos.record`)."""
 MOST_EPISODES = 4_000
-"""Most demonstrations of a dataset: few enough that all are the training seed's own."""
+"""Most demonstrations of a dataset: few enough that all starts are the training seed's own."""
 DEMONSTRATORS = (*SCRIPTED_DEMONSTRATORS, *sorted(CHOOSING_DEMONSTRATORS))
-"""Who may demonstrate: a scripted expert, or what re-poses other demonstrations."""
+"""Who may demonstrate: a scripted expert, or one that re-poses other demonstrations."""
 
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """Demonstrations that policies are trained on, and the images rendered of them.
+    """Demonstrations that policies are trained on, and the images rendered from them.
 
     Attributes:
-        name: how the policies' `demonstrations` call them.
+        name: the name that the policies' `demonstrations` refer to.
         task: the task that is demonstrated.
         episodes: how many.
-        view: rendered views; none where no image is learned from.
+        view: rendered views; empty where no policy learns from images.
         demonstrator: who demonstrates.
-        noise: how much what the demonstrator executes is disturbed.
-        jaw_noise: the same of the jaw, while it is not told to close.
+        noise: noise on the actions that the demonstrator executes (`Disturbance`).
+        jaw_noise: noise on the jaw's motion while it is not told to close.
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
-        late: most control steps by which a demonstrator that goes back notices a loss late.
+        late: largest delay [control steps] with which a demonstrator that goes back notices a loss.
         post_success_steps: control steps an episode goes on after its success.
         frame_stride: control steps from frame to frame.
-        env: fields of `TaskConfig` in the place of the plan's: a world that varies more than the
-            one policies are evaluated in.
+        env: fields of `TaskConfig` that replace the plan's, such as a world that varies more than
+            the one policies are evaluated in.
         visits_of: name of demonstrations of the whole procedure, whose visits of this task
-            (`demos.cut`) are rendered beside these.
+            (`demos.cut`) are rendered with these.
         appearance: the looks they are rendered in (`core.variants`), "train" or one of its
             families; "" renders each as it was recorded.
-        distractors: most things that lie about in what is rendered; 0 leaves what was recorded.
+        distractors: most distractors in the rendered scene; 0 leaves those that were recorded.
         variants: in how many looks each demonstration is rendered.
-        corruption: largest strength of smoke, blur and pixel noise on what is rendered.
+        corruption: largest strength of smoke, blur and pixel noise on the rendered images.
         of: name of demonstrations of the same task, which are re-posed to new starts where the
             demonstrator is "multiply" (`demos.multiply`).
         learner: name of a policy of the same task that acts at first, from starts that it was not
-            trained on, while the labels stay the demonstrator's (`experiments.dagger`); what it
-            was trained on is rendered beside these.
+            trained on, while the labels stay the demonstrator's (`experiments.dagger`); the
+            demonstrations it was trained on are rendered with these.
 
     Raises:
         InputError: a number out of its range, variants without a look to draw, a demonstrator
-            without the demonstrations it re-poses, or such demonstrations without one, or with a
-            learner.
+            without the demonstrations it re-poses, or such demonstrations without that demonstrator
+            or with a learner.
         UnknownName: no such demonstrator or appearance.
     """
 
@@ -107,14 +107,14 @@ class Demonstrations:
 
     @property
     def looks(self) -> Variants | None:
-        """The looks each is rendered in; None as it was recorded."""
+        """The looks each is rendered in; None keeps the recorded look."""
         if not (self.appearance or self.distractors or self.corruption) and self.variants == 1:
             return None
         return Variants(self.appearance, self.distractors, self.variants, self.corruption)
 
     @property
     def disturbance(self) -> Disturbance:
-        """What goes wrong in them."""
+        """What disturbs their episodes."""
         return Disturbance(
             self.noise,
             upset_fraction=self.upset_fraction,
@@ -124,7 +124,7 @@ class Demonstrations:
 
     @property
     def manner(self) -> str:
-        """How is demonstrated, in words."""
+        """How they are demonstrated, in words."""
         after = self.post_success_steps
         who = f"re-posed from '{self.of}'" if self.of else f"by the scripted {self.demonstrator}"
         parts = [who]
@@ -149,7 +149,7 @@ class DatasetConfig:
         env: the task and its scene.
         demonstrations: what is recorded and rendered.
         size: height and width of the images [px].
-        depth: render depth beside RGB.
+        depth: render depth as well as RGB.
         first_seed: start seed of the first demonstration.
         visited: the whole procedures whose visits are rendered too, where `demonstrations` says so.
         multiplied: the demonstrations that are re-posed, where `demonstrations` says so.
@@ -175,7 +175,7 @@ def first_seed(training_seed: int) -> int:
     """Return the first start seed of a training seed's demonstrations.
 
     Raises:
-        InputError: a training seed that has none of its own.
+        InputError: a training seed without start seeds of its own.
     """
     if not 0 <= training_seed < TRAINING_SEEDS:
         raise InputError(

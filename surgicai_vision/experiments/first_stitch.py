@@ -5,7 +5,7 @@
 
 The folder gets `procedure.mp4`, `procedure.webp` (the same as an animation, for a page that
 plays no video), `strip.jpg`, `poster.jpg` (the video's first image) and, written last,
-`procedure.json`; where that is there nothing is done again.
+`procedure.json`. If this file exists, nothing is done again.
 """
 
 import time
@@ -38,10 +38,10 @@ MOVING: Final = "procedure.webp"
 MOVING_EVERY: Final = 2
 MOVING_QUALITY: Final = 60
 MOVING_EFFORT: Final = 2
-"""Every so many of the video's images make the moving picture, WebP of this quality: 0.9 MB for a
-procedure of 8 s."""
+"""The animation takes every `MOVING_EVERY`-th image of the video, as WebP of this quality: 0.9 MB
+for a procedure of 8 s."""
 STARTS: Final = range(names.TEST_SEED, names.TEST_SEED + 3)
-"""Held-out starts that are tried in order; each that fails is said."""
+"""Held-out starts that are tried in order; each failure is reported."""
 LOOK: Final = Look(views=("front", "back"), size=320)
 STRIP_SIZE: Final = 224
 """Height and width of the film strip's images [px]."""
@@ -55,7 +55,7 @@ class Sewer:
         spec: what acts.
         name: its name.
         who: who that is, in words.
-        why: why it is not the one that was asked for; "" where it is.
+        why: why it is not the requested one; "" where it is.
     """
 
     spec: PolicySpec
@@ -65,14 +65,14 @@ class Sewer:
 
 
 def find_sewer(given: str) -> Sewer:
-    """Return who sews: the policy asked for or, in the place of a released one, the expert.
+    """Return who sews: the requested policy or, if a released one cannot be used, the expert.
 
     Args:
         given: whatever `open_policy` takes for a whole procedure. A released policy that is not
-            there, or of another scene, is stood in for by the scripted expert.
+            there, or of another scene, is replaced by the scripted expert.
 
     Raises:
-        InputError: it is nothing that can sew a whole procedure.
+        InputError: it cannot sew a whole procedure.
     """
     expert = "the scripted expert, which reads the simulator's state and sees no image"
     if given == "expert":
@@ -99,7 +99,7 @@ def sew(
     Args:
         sewer: who sews.
         out: folder to make or to continue.
-        say: told a line as each subtask ends.
+        say: called with a line as each subtask ends.
         stage: shows progress.
         starts: seeds of the starts; the last one is filmed even if it fails.
 
@@ -202,7 +202,7 @@ def _with_poster(frames: Iterator[Image], path: Path) -> Iterator[Image]:
 
 
 def _counted(frames: Iterator[Image], progress: Callable[..., None], total: int) -> Iterator[Image]:
-    """Yield the frames and tell how many have been."""
+    """Yield the frames and report how many there have been."""
     for count, frame in enumerate(frames, 1):
         progress(min(count, total), total)
         yield frame

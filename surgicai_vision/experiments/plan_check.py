@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def check_plan(plan: "Plan") -> None:
-    """Refuse a plan that names what it does not have, or that cannot be run as it says.
+    """Refuse a plan that names something it does not contain, or that cannot be run as it says.
 
     Raises:
         InputError: what is wrong, and what is allowed.
@@ -62,7 +62,7 @@ def check_plan(plan: "Plan") -> None:
 
 
 def _check_env(where: str, env: Mapping[str, JSON], done: str) -> None:
-    """Refuse fields of an env that are not the file's to say."""
+    """Refuse fields of an env that a file may not set."""
     for key in ("task", "advance"):
         if key in env:
             raise InputError(
@@ -71,7 +71,7 @@ def _check_env(where: str, env: Mapping[str, JSON], done: str) -> None:
 
 
 def _check_visits(plan: "Plan", recorded: Demonstrations) -> None:
-    """Refuse visits of what is no subtask, or in what is not recorded as a whole procedure."""
+    """Refuse visits of a task that is no subtask, or in anything but whole procedures."""
     if not recorded.visits_of:
         return
     whole = [each.name for each in plan.demonstrations if each.task == names.SUTURE]
@@ -102,7 +102,7 @@ def _check_multiplied(plan: "Plan", recorded: Demonstrations) -> None:
 
 
 def _check_learner(plan: "Plan", recorded: Demonstrations) -> None:
-    """Refuse a learner of another task, or one that is trained on what it acts in."""
+    """Refuse a learner of another task, or one trained on the demonstrations it acts in."""
     policies = {policy.name: policy for policy in plan.policies}
     behind = [recorded.name]
     learner = recorded.learner
@@ -134,7 +134,7 @@ def _check_learner(plan: "Plan", recorded: Demonstrations) -> None:
 
 
 def _check_policy(plan: "Plan", policy: PlannedPolicy) -> None:
-    """Refuse a policy of what is not recorded, or not rendered."""
+    """Refuse a policy whose demonstrations are not recorded, or whose views are not rendered."""
     known = [recorded.name for recorded in plan.demonstrations]
     check_name("demonstrations", policy.demonstrations, known)
     if policy.subtask is not None:
@@ -147,7 +147,7 @@ def _check_policy(plan: "Plan", policy: PlannedPolicy) -> None:
 
 
 def _check_condition(plan: "Plan", condition: Condition) -> None:
-    """Refuse a condition of what is not trained, or that no env or procedure can have."""
+    """Refuse a condition for what is not trained, or that no env or procedure accepts."""
     evaluated = [policy.name for policy in plan.policies if policy.acts]
     if names.SUTURE in plan.names:
         evaluated.append(names.SUTURE)

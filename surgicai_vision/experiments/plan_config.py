@@ -1,13 +1,13 @@
-"""Plan: a set of policies rebuilt from nothing, as data; light to import, for the command line.
+"""Plan: a set of policies rebuilt from scratch, as data; light to import, for the command line.
 
 A plan is one YAML file that says what is recorded and rendered (`demonstrations`), what is trained
 on what (`policies`), and what is evaluated in which conditions (`conditions`):
 
     size: 224
-    encoder: imagenet-lite-early         # of every policy that sees and names no other
+    encoder: imagenet-lite-early         # of every policy with views that names no other
     pool: spatial
     recipe: best                         # likewise
-    seed: [0, 1, 2]                      # training seeds; each draws demonstrations of its own
+    seed: [0, 1, 2]                      # training seeds; each has its own demonstrations
     episodes: 100                        # held-out starts of each evaluation
     demonstrations:
       - {name: search, task: grasp, episodes: 350, demonstrator: search, view: [front_psm2]}
@@ -23,13 +23,13 @@ on what (`policies`), and what is evaluated in which conditions (`conditions`):
       - {name: moved, policies: [suture], env: {randomisation: {phantom_shift: 10}}}
       - {name: privileged, policies: [suture], procedure: {termination: privileged}}
 
-A policy takes part in the whole procedure by its `part`, else by its name: the five subtasks and
-`hlp` make `suture`. So a plan may have both a `grasp`, counted on its own task, and a
-`{name: suture-grasp, part: grasp, …}` of whole procedures.
-A plan that differs from another in a few keys names it, and these alone:
+A policy's `part`, or else its name, says which part of the whole procedure it does: the five
+subtasks and `hlp` make up `suture`. So a plan may have both a `grasp`, evaluated on its own task,
+and a `{name: suture-grasp, part: grasp, …}` for whole procedures.
+A plan that differs from another in a few keys names that plan and gives only these keys:
 
     base: endoscope                      # a shipped plan, or a file's path from this one's folder
-    env: {scene: {tissue: soft}}         # a key stands in place of the base's, whole
+    env: {scene: {tissue: soft}}         # a key replaces the base's key as a whole
     conditions: [{name: soft}]
 
 Two commands take a plan:
@@ -37,13 +37,13 @@ Two commands take a plan:
 * `surgicai-vision sweep PLAN.yaml`: every training seed in every condition, in one folder
   (`experiments.sweep`); a condition's starts are the same for every seed, and the same as those of
   the other conditions. Seeds and conditions may be added later, in the same folder.
-* `surgicai-vision release --plan PLAN.yaml`: its first training seed alone, counted as trained, as
-  the policies that come with the product (`experiments.release`).
+* `surgicai-vision release --plan PLAN.yaml`: only its first training seed, evaluated as trained;
+  these become the policies that come with the product (`experiments.release`).
 
-What it lists is in `plan_parts`, what is refused before any work in `plan_check`.
+`plan_parts` defines what a plan lists, `plan_check` what is refused before any work.
 
-Everything a seed's policies are made of depends on that seed: `dataset_config.first_seed` gives
-each demonstrations that no other seed has, and none of them is a start of an evaluation.
+Everything a seed's policies are made from depends on that seed: `dataset_config.first_seed` gives
+each seed demonstrations that no other seed has. None of them begins at a start of an evaluation.
 """
 
 import functools
@@ -105,18 +105,18 @@ class Plan:
         recipe: the recipe of every policy that names no other.
         episodes: starts of each evaluation.
         demonstrations: what is recorded and rendered.
-        policies: what is trained; the five subtasks and the high-level policy make `suture`.
+        policies: what is trained; the five subtasks and the high-level policy make up `suture`.
         seed: training seeds.
-        conditions: what is evaluated how.
-        procedure: when a subtask of the whole procedure ends, as `HierarchicalConfig` has it.
+        conditions: the conditions of the evaluations.
+        procedure: fields of `HierarchicalConfig` for the whole procedure.
         epochs: passes over the frames, of every policy; None takes the recipes'.
-        env: fields of `TaskConfig` that differ from the default's, in every task: in what is
-            recorded and what is evaluated, each as far as these name no such field themselves.
+        env: fields of `TaskConfig` that differ from the default's, in every task: for recording
+            and evaluation, except where demonstrations or conditions give a field themselves.
         starts: the bank of the evaluations' starts, one of `BANKS`.
-        expert: evaluate the expert beside the policies, in every condition.
+        expert: evaluate the expert alongside the policies, in every condition.
         accept_licence: accept weights under a non-commercial licence.
         licence: the policies' licence, where they are released.
-        not_run: rows that are listed and not run, with what they need.
+        not_run: rows that are listed but not run, with what they need.
     """
 
     size: int
@@ -151,11 +151,11 @@ class Plan:
         return from_mapping(TaskConfig, fields, "env")
 
     def evaluated_env(self, run: RunConfig, condition: Condition) -> Mapping[str, JSON]:
-        """Return the fields of `TaskConfig` that an evaluation has, whatever was trained on.
+        """Return the fields of `TaskConfig` that an evaluation sets, whatever was trained on.
 
-        An empty table keeps the env that the policies were trained in: so what demonstrations
-        alone have, looks they are rendered in among it, is named with its default in the task. The
-        whole procedure's step limit is not: it is no policy's, but `HierarchicalConfig`'s.
+        An empty table keeps the env that the policies were trained in. So fields that only
+        demonstrations change, including the looks they are rendered in, are set to the task's
+        defaults. The whole procedure's step limit is left out: it is `HierarchicalConfig`'s.
         """
         plain = to_mapping(TaskConfig(run.task))
         own = [key for recorded in self.demonstrations for key in recorded.env]
@@ -170,12 +170,12 @@ class Plan:
         return self._named(policy.demonstrations)
 
     def learned(self, recorded: Demonstrations) -> Demonstrations | None:
-        """Return what the learner that acts in demonstrations was trained on; None without one."""
+        """Return the demonstrations that a learner in `recorded` was trained on; else None."""
         return self.recorded(self.policy(recorded.learner)) if recorded.learner else None
 
     @functools.cached_property
     def learners(self) -> Mapping[str, Training]:
-        """The policies that act in demonstrations, by the names of the datasets of these."""
+        """The policies that act in demonstrations, by the names of the datasets they act in."""
         return {
             _dataset_name(recorded, seed): self._training(self.policy(recorded.learner), seed)
             for seed in self.seed
@@ -237,12 +237,12 @@ class Plan:
 
     @property
     def _built(self) -> tuple[PlannedPolicy, ...]:
-        """The policies but for those that only act in demonstrations."""
+        """The policies except those that only act in demonstrations."""
         learners = {recorded.learner for recorded in self.demonstrations}
         return tuple(policy for policy in self.policies if policy.name not in learners)
 
     def _rounds(self, recorded: Demonstrations) -> int:
-        """Return how many learners, one trained on what the other acted in, there were."""
+        """Return how many learners there were, each trained on what the one before acted in."""
         first = self.learned(recorded)
         return 1 + self._rounds(first) if first else 0
 
@@ -254,7 +254,7 @@ class Plan:
 
     @functools.cached_property
     def suture(self) -> Mapping[str, PlannedPolicy]:
-        """The policies of the whole procedure by their parts; not all where the plan lacks some."""
+        """The policies of the whole procedure by their parts, as far as the plan has them."""
         named = {policy.name: policy for policy in self.policies if not policy.part}
         given = {policy.part: policy for policy in self.policies if policy.part}
         found = {**named, **given}
@@ -267,7 +267,7 @@ class Plan:
 
         Args:
             condition: the condition; None takes the plan's own procedure.
-            parts: name of each part → its folder; one that is not given stands for itself.
+            parts: name of each part → its folder; a part that is not given keeps its name.
         """
         everyone = {part: part for part in PARTS}
         other = condition.procedure if condition else {}
@@ -305,7 +305,7 @@ class Plan:
 
     @functools.cached_property
     def _listed(self) -> dict[RunConfig, str]:
-        """Each run that is listed alone → what it needs; in every condition without a shift."""
+        """Each run that is only listed → what it needs; in every condition without a shift."""
         return {
             RunConfig(
                 self.task_config(task, condition),
@@ -322,7 +322,7 @@ class Plan:
         }
 
     def needs(self, run: RunConfig) -> str:
-        """Return what a run needs that is not here; "" where it may be run."""
+        """Return what a run needs that is not available; "" where it can be run."""
         return self._listed.get(run, "")
 
     def _run(self, name: str, condition: Condition, seed: int) -> RunConfig:
@@ -357,7 +357,7 @@ class Plan:
 
     @property
     def _digest(self) -> str:
-        """Hash of what the whole procedure's policies are but for the training seed."""
+        """Hash of what decides the whole procedure's policies, except the training seed."""
         table = {
             **to_mapping(self),
             "demonstrations": list(map(to_identity, self.demonstrations)),
@@ -404,7 +404,7 @@ class Plan:
         return Evaluated(self.evaluated_env(run, condition), procedure)
 
     def references(self, runs: Sequence[RunConfig]) -> tuple[RunConfig, ...]:
-        """Return the expert on each task and condition of the runs, where it is asked for."""
+        """Return the expert on each task and condition of the runs, if the plan requests it."""
         found = {
             RunConfig(
                 run.env,
@@ -420,11 +420,11 @@ class Plan:
         return tuple(found)
 
     def table(self) -> Mapping[str, JSON]:
-        """Return it as plain data."""
+        """Return the plan as plain data."""
         return to_mapping(self)
 
     def extends(self, stored: Mapping[str, JSON]) -> bool:
-        """Return True if `stored` is this plan, but for training seeds and conditions it lacks."""
+        """Return True if `stored` is this plan, but lacks some training seeds or conditions."""
         other = plan_of(stored, "the stored plan")
         return (
             to_mapping(replace(self, seed=other.seed, conditions=other.conditions)) == stored
@@ -477,7 +477,7 @@ def _dataset_name(recorded: Demonstrations, seed: int) -> str:
 
 
 def plan_of(table: Mapping[str, object], where: str) -> Plan:
-    """Build a plan from plain data; one training seed may stand without brackets.
+    """Build a plan from plain data; a single training seed may be given without brackets.
 
     Raises:
         InputError: a key or a value that is not allowed.
@@ -488,7 +488,7 @@ def plan_of(table: Mapping[str, object], where: str) -> Plan:
 
 
 def read_plan(path: Path | None = None) -> Plan:
-    """Read a plan, by default that of the policies which come with the product.
+    """Read a plan, by default that of the policies that come with the product.
 
     Raises:
         BadFile: it cannot be read.

@@ -21,14 +21,14 @@ class PlannedPolicy:
 
     Attributes:
         name: its name.
-        demonstrations: name of what it is trained on.
-        subtask: take one subtask's frames of whole procedures.
-        view: what it sees; nothing for proprioception alone.
+        demonstrations: name of the demonstrations it is trained on.
+        subtask: train on this subtask's frames of whole procedures.
+        view: the views it sees; empty for proprioception alone.
         policy: its kind.
         encoder: its encoder; None takes the plan's. Likewise `pool` and `recipe`.
         change: what is changed in the recipe, "key=value" each.
-        part: its part in the whole procedure, a subtask or `HLP`; none is what its name says, where
-            no other policy has that part.
+        part: its part in the whole procedure, a subtask or `HLP`; empty takes the part of its name,
+            unless another policy has that part.
     """
 
     name: str
@@ -44,27 +44,27 @@ class PlannedPolicy:
 
     @property
     def acts(self) -> bool:
-        """Whether it is evaluated by itself; what has a `part` is judged in the whole alone."""
+        """Whether it is evaluated by itself; with a `part`, only in the whole procedure."""
         return self.policy != HLP and not self.part
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What differs in an evaluation from the training.
+    """What an evaluation changes relative to the training.
 
     Attributes:
-        name: how tables call it.
-        policies: the policies of the plan that are evaluated so, the whole procedure as `suture`;
-            none named are all that act.
-        env: fields of `TaskConfig` in the place of the plan's. A field stands whole in its place:
-            `randomisation: {camera_shift: 2}` has that axis alone, whatever the plan's has, and
-            `randomisation: {}` none. A field that is not named is the plan's, not what some
+        name: its name in tables.
+        policies: the policies of the plan that are evaluated in it, the whole procedure as
+            `suture`; empty takes all that act.
+        env: fields of `TaskConfig` that replace the plan's, each as a whole:
+            `randomisation: {camera_shift: 2}` has only that axis, whatever the plan's has, and
+            `randomisation: {}` none. A field that is not given is the plan's, not what some
             demonstrations alone have (`plan_config.Plan.evaluated_env`).
-        procedure: fields of `HierarchicalConfig` in the place of the plan's; `place: expert` puts
-            the expert in for a policy.
+        procedure: fields of `HierarchicalConfig` that replace the plan's; `place: expert` replaces
+            a policy with the expert.
         upset: let one thing go wrong in every episode (`envs.upset`).
-        seed: training seeds that are evaluated so; all by default.
-        episodes: starts; the plan's by default.
+        seed: training seeds that are evaluated in it; all by default.
+        episodes: number of starts; the plan's by default.
         shift: an axis of robustness (`evaluation.robustness.AXES`) and its strength, 0 to 1.
     """
 
@@ -83,7 +83,7 @@ class NotRun:
     """Rows of a plan that cannot be run where it was written, and what they need.
 
     Attributes:
-        policy: what they are of.
+        policy: their policy.
         task: their tasks.
         needs: what is needed, for the reader.
     """

@@ -37,9 +37,9 @@ def make_dataset(
 ) -> Path:
     """Record and render what `dataset` says, into `folder`/demos and `folder`/dataset.
 
-    Visits in whole procedures lie in `folder`/visits. The procedures themselves, and demonstrations
-    that are re-posed, are recorded into the folder beside `folder` that has their name, where they
-    are not there yet. What a learner was trained on was made there before it.
+    Visits in whole procedures go into `folder`/visits. The procedures themselves, and
+    demonstrations that are re-posed, are recorded into the folder next to `folder` that has their
+    name, if they are not there yet. What a learner was trained on is there already.
 
     Returns:
         The dataset's folder; that of the demonstrations where nothing is rendered.
@@ -70,7 +70,7 @@ def make_dataset(
 
 
 def _learned(dataset: DatasetConfig, folder: Path) -> list[Path]:
-    """Return the demonstrations that the learner was trained on, and its learner, and so on."""
+    """Return the demonstrations the learner was trained on, those of its learner, and so on."""
     first = dataset.learned
     if first is None:
         return []
@@ -80,7 +80,7 @@ def _learned(dataset: DatasetConfig, folder: Path) -> list[Path]:
 
 
 def _recorded(other: DatasetConfig, folder: Path, context: RunContext) -> Path:
-    """Record what a dataset builds on into the folder beside it; return the demonstrations'."""
+    """Record what a dataset builds on, next to it; return the folder of the demonstrations."""
     alone = replace(other, demonstrations=replace(other.demonstrations, view=()))
     return make_dataset(alone, folder.parent / other.demonstrations.name, context)
 

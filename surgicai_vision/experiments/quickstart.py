@@ -1,12 +1,12 @@
-"""Quickstart, in two acts: a whole procedure to watch, then the whole flow once, small.
+"""Quickstart, in two acts: a whole procedure to watch, then the whole workflow at a small scale.
 
 Act 1: a released policy sews one stitch from images; a video is written (`first_stitch`). Act 2:
-demonstrations of one subtask, rendered, encoded; policies trained on them and counted on the same
-held-out starts.
+demonstrations of one subtask are recorded, rendered and encoded; policies are trained on them and
+evaluated on the same held-out starts.
 
 One folder holds everything: `procedure/`, `demos/`, `dataset/`, `policies/<name>/`,
-`evaluations/<name>/`, `run.json` and `report.html`. A step that is there is not done again, so the
-same command continues a broken-off run.
+`evaluations/<name>/`, `run.json` and `report.html`. A finished step is not repeated, so the
+same command continues an interrupted run.
 """
 
 import functools
@@ -50,15 +50,15 @@ def run_quickstart(
         plan: what to do.
         out: the folder; one of another plan is refused.
         context: processes and progress.
-        say: told a line wherever something has come out.
+        say: called with a line for each result.
 
     Returns:
-        {"report", "procedure" (what the first act came to, or None), "results" (summaries, expert
+        {"report", "procedure" (result of the first act, or None), "results" (summaries, expert
         last), "seconds"}.
 
     Raises:
         MissingWeights: an encoder's weights are not at hand; before any work.
-        InputError: this machine draws no image; before any work.
+        InputError: this machine cannot render images; before any work.
         UnknownName: a recipe that does not exist; before any work.
         OutputExists: `out` holds something else.
     """
@@ -92,7 +92,7 @@ def _first_act(
     context: RunContext,
     say: Callable[[str], None],
 ) -> Row:
-    """Sew a procedure on film, and say what comes next; return what it came to."""
+    """Sew and film a procedure, and announce what comes next; return the result."""
     say(f"Act 1. A whole procedure by {sewer.who}.")
     if sewer.why:
         say(f"  In the place of {plan.procedure}, which cannot: {sewer.why}")
@@ -111,7 +111,7 @@ def _first_act(
 def _second_act(
     plan: Quickstart, out: Path, state: Row, context: RunContext, say: Callable[[str], None]
 ) -> list[Row]:
-    """Train the policies and count their successes; return the summaries, the expert's last."""
+    """Train and evaluate the policies; return the summaries, the expert's last."""
     seeds = Starts(names.TEST_SEED, plan.episodes).seeds
     evaluations = out / "evaluations"
     results: list[Row] = []
@@ -150,7 +150,7 @@ def _second_act(
 
 
 def _finding(plan: Quickstart, results: Sequence[Row]) -> dict[str, str]:
-    """Return the page's headline, how many of how many beside what, and the line below it."""
+    """Return the page's headline, successes next to those of others, and the line below it."""
     trained = list(zip(plan.runs, results, strict=False))
     (run, shown), *others = trained
     beside = ", ".join(f"{_words(other)} {result['successes']}" for other, result in others)
@@ -181,7 +181,7 @@ def _words(run: RunConfig) -> str:
 
 
 def _seen(run: RunConfig) -> str:
-    """Return what a policy sees and with what, in brackets; nothing for proprioception alone."""
+    """Return a policy's encoder and views, in brackets; empty for proprioception alone."""
     return f" ({run.encoder} on {' + '.join(run.views)})" if run.encoder else ""
 
 

@@ -29,17 +29,17 @@ class PolicyChoice:
 
 @dataclass(frozen=True)
 class Quickstart:
-    """What a quickstart does; the defaults are configs/quickstart.yaml.
+    """What a quickstart does; the defaults are those of configs/quickstart.yaml.
 
     Attributes:
         procedure: who sews the whole procedure of the first act; None leaves it out.
         task: the task of the second act.
         demonstrations: expert demonstrations to train on.
-        noise: how much what the expert executes is disturbed.
+        noise: noise on the actions that the expert executes.
         view: rendered views.
         size: height and width of images [px].
         frame_stride: control steps from frame to frame.
-        policies: what is trained and evaluated, the one to be shown first.
+        policies: what is trained and evaluated; the first one is in the headline.
         episodes: held-out starts of each evaluation.
         seed: training seed.
     """
@@ -76,7 +76,7 @@ class Quickstart:
 
     @property
     def runs(self) -> list[RunConfig]:
-        """One run a policy."""
+        """One run per policy."""
         return [
             RunConfig(
                 TaskConfig(self.task),

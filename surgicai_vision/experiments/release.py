@@ -1,14 +1,14 @@
-"""Release: build the policies that come with the product, from nothing to their cards.
+"""Release: build the policies that come with the product, from scratch to their cards.
 
-Record, render, encode, train, evaluate on held-out starts, write the card. One folder holds the
-work, below the hash of the scene it is done in, for the first training seed of the plan:
+Record, render, encode, train, evaluate on held-out starts, write the card. A folder named after the
+hash of the scene holds the work, for the first training seed of the plan:
 
     <out>/<scene hash>/<demonstrations>/demos, dataset
     <out>/<scene hash>/policies/<name>, evaluations/<name>
 
-A step that is there is not done again, so the same command continues a broken-off build, and a
-changed scene begins anew. Each policy goes into `released_folder()` as soon as it is counted; the
-whole procedure comes last, of parts that are released by then.
+A finished step is not repeated, so the same command continues an interrupted build; a changed scene
+starts over. Each policy goes into `released_folder()` as soon as it is evaluated; the whole
+procedure comes last, from parts that are released by then.
 """
 
 import functools
@@ -54,7 +54,7 @@ from surgicai_vision.training.run_config import Starts
 
 PLAN_FILE = "plan.json"
 SHOWN = 5
-"""Solved starts that a card names: they are solved again wherever the policy is installed."""
+"""Solved starts that a card names; they are solved again wherever the policy is installed."""
 
 
 def run_release(
@@ -73,8 +73,8 @@ def run_release(
 
     Raises:
         UnknownName: a policy, view, encoder or recipe that does not exist; before any work.
-        InputError: a folder that cannot be written, or a machine that draws no image; before any
-            work.
+        InputError: a folder that cannot be written, or a machine that cannot render images;
+            before any work.
         MissingWeights: the encoder's weights are not at hand; before any work.
         OutputExists: `out` holds the work of another plan.
     """
@@ -114,7 +114,7 @@ class _Build:
     context: RunContext
 
     def claim(self) -> None:
-        """Make the folder of the work, or refuse that of another plan."""
+        """Make the folder of the work, or refuse the folder of another plan."""
         files.check_output(self.out, may_resume=PLAN_FILE)
         path = self.out / PLAN_FILE
         wanted = to_mapping(self.plan)
@@ -129,7 +129,7 @@ class _Build:
         files.write_json(path, wanted)
 
     def subtask(self, policy: PlannedPolicy) -> ReleaseCard:
-        """Train, count and release one policy."""
+        """Train, evaluate and release one policy."""
         recorded = self.plan.recorded(policy)
         folder = self._trained(policy)
         checkpoint = read_checkpoint(folder)
@@ -151,7 +151,7 @@ class _Build:
         return read_card(policy.name)
 
     def procedure(self) -> ReleaseCard:
-        """Count the whole procedure by the released parts, and release it."""
+        """Evaluate the whole procedure with the released parts, and release it."""
         together = [policy.name for policy in self.plan.suture.values()]
         hashes = {name: read_card(name).files[WEIGHTS] for name in together}
         parts = {part: f"{PREFIX}{policy.name}" for part, policy in self.plan.suture.items()}
@@ -175,18 +175,18 @@ class _Build:
         return read_card(names.SUTURE)
 
     def _trained(self, policy: PlannedPolicy) -> Path:
-        """Train a policy where that is not done yet; return its folder."""
+        """Train a policy if that is not done yet; return its folder."""
         folder = self.out / "policies" / policy.name
         if not (folder / CARD).exists():
             dataset: Dataset = open_dataset(self._dataset(self.plan.recorded(policy)))
-            if policy.subtask:  # before the encoding: no other frame is encoded
+            if policy.subtask:  # before encoding, so that no other frame is encoded
                 dataset = of_subtask(dataset, policy.subtask)
             run = self.plan.training(policy, self.plan.seed[0])
             train_run(run, dataset, folder, self.context.stage)
         return folder
 
     def _dataset(self, recorded: Demonstrations) -> Path:
-        """Record, by a learner trained before where one acts, and render; return the folder."""
+        """Record, after training the learner if one acts, and render; return the folder."""
         dataset = self.plan.dataset(recorded, self.plan.seed[0])
         learner = None
         if recorded.learner:
@@ -195,7 +195,7 @@ class _Build:
         return make_dataset(dataset, self.out / recorded.name, self.context, learner)
 
     def _counted(self, card: ReleaseCard, given: str | Path, folder: str) -> ReleaseCard:
-        """Evaluate a policy on the held-out starts; return its card with the count."""
+        """Evaluate a policy on the held-out starts; return its card with the successes."""
         starts = Starts(names.TEST_SEED, self.plan.episodes)
         out = self.out / "evaluations" / folder
         summary = evaluate_once(

@@ -1,7 +1,7 @@
-"""One run: a policy from features to counted successes.
+"""One run: a policy from features to measured successes.
 
-A quickstart is a list of runs, a sweep a grid of them. Every step leaves a whole folder and skips
-the one that is there, so running again continues.
+A quickstart is a list of runs, a sweep a grid of them. Every step leaves a complete folder and is
+skipped if that folder exists, so running again continues.
 """
 
 import functools
@@ -50,23 +50,23 @@ def train_run(
     device: str | None = None,
     log: Callable[[int, dict[str, float]], None] | None = None,
 ) -> None:
-    """Encode a run's views, from the cache where they are at hand, and train its policy.
+    """Encode a run's views, or take them from the cache, and train its policy.
 
     Args:
         run: what to train.
         dataset: an opened dataset of the run's task.
-        out: checkpoint folder; one of the same training is continued, or left as it is.
+        out: checkpoint folder; one of the same training is continued, or left if complete.
         stage: shows progress.
         weights: where pretrained weights come from.
         start: checkpoint folder to start from (fine-tuning).
-        progress_from: checkpoint folder of the policy whose progress a recipe with
-            `progress_input` feeds.
+        progress_from: checkpoint folder of the policy that predicts the progress, for a recipe with
+            `progress_input`.
         subtask: train on this subtask's frames of the dataset's whole procedures.
         demos: folder of the dataset's demonstrations, for a policy that plans chunks where the
             dataset was rendered with fewer frames than control steps.
-        save_every: also keep a checkpoint every so many epochs.
-        device: where to encode and train, one of `features.devices.DEVICES`; by default it is
-            encoded on a GPU where there is one, and trained on the CPU.
+        save_every: also keep a checkpoint every `save_every` epochs.
+        device: where to encode and train, one of `features.devices.DEVICES`; by default a
+            GPU encodes, if there is one, and the CPU trains.
         log: called with (epoch, losses by name).
     """
     recipe = policies.recipe_of(run)
@@ -106,13 +106,13 @@ def train_run(
 
 
 class _Learned(NamedTuple):
-    """The frames a policy learns from and their features, one entry a view."""
+    """The frames a policy learns from and their features, one entry per view."""
 
     dataset: Dataset
     features: Sequence[Features]
 
     def select(self, subset: DatasetSubset) -> "_Learned":
-        """Return the same of a subset of the dataset."""
+        """Return the same for a subset of the dataset."""
         parts = [entry.part(subset.rows, subset.fingerprint) for entry in self.features]
         return _Learned(subset, parts)
 
@@ -135,9 +135,9 @@ def _selections(
     subtask: str | None,
     demos: Path | None,
 ) -> Iterator[Callable[[Dataset], DatasetSubset]]:
-    """Yield what selects a run's frames of `dataset`, each from what the one before left.
+    """Yield the selections of a run's frames of `dataset`, each applied to the result before it.
 
-    Chunks of actions come first, for they reach into frames that are left out later.
+    Chunks of actions come first, because they reach into frames that are left out later.
     """
     if plugin.offsets is not None:
         offsets = plugin.offsets(recipe)
@@ -153,7 +153,7 @@ def _within_budget(
 ) -> Recipe:
     """Return the recipe with the epochs that fit into its minutes, where it has a budget.
 
-    A training that was broken off goes on with the number it was begun with.
+    An interrupted training continues with the number of epochs it was begun with.
     """
     if not (isinstance(recipe, ChunkRecipe) and recipe.minutes):
         return recipe
@@ -188,7 +188,7 @@ def _encode(
 def _encode_views(
     encoder: Encoder | None, views: Sequence[str], dataset: Dataset, stage: Stage, title: str
 ) -> list[Features]:
-    """Encode all frames of `dataset`, one entry a view; none without an encoder."""
+    """Encode all frames of `dataset`, one entry per view; none without an encoder."""
     features: list[Features] = []
     if encoder is None:
         return features

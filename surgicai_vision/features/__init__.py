@@ -1,1 +1,1 @@
-"""Features: frozen encoders, the cache of what they computed, and a linear probe of it."""
+"""Features: frozen encoders, the cache of their features, and a linear probe of them."""

@@ -9,15 +9,15 @@ Interface:
 
 An entry is addressed by its content: the dataset's fingerprint, the view, and the encoder's
 fingerprint (weights, preprocessing, pool, compute type). So encoding twice does nothing, and a
-changed dataset or weights file never meets an old entry. Layout of `<cache root>/features/<key>/`:
+changed dataset or weights file never hits an old entry. Layout of `<cache root>/features/<key>/`:
 
-    features.npy    (N, dim) float16, allocated whole at the start
+    features.npy    (N, dim) float16, allocated in full at the start
     progress.json   rows already on disk; written after each chunk
-    manifest.json   what was encoded; written last, its presence makes the entry complete
+    manifest.json   what was encoded; written last: its presence marks the entry as complete
     lock            held while a process writes
 
-A process killed at any moment leaves `progress.json` behind its rows, and the next call goes on
-there.
+Whenever a process is killed, `progress.json` counts no more rows than are on disk. The next call
+resumes there.
 """
 
 import math
@@ -61,11 +61,11 @@ PROGRESS = "progress.json"
 ROWS = "features.npy"
 LOCK = "lock"
 NOT_ROWS = (OSError, ValueError, OverflowError, TypeError, tokenize.TokenError)
-"""What numpy raises at a file that holds no rows; the last at the header of one that is torn."""
+"""What numpy raises for a file that holds no rows; the last one is for a truncated header."""
 
 
 class Manifest(TypedDict):
-    """What an entry holds and by what it was encoded."""
+    """What an entry holds and how it was encoded."""
 
     format: int
     dataset: str
@@ -100,7 +100,7 @@ class Features:
 
     Attributes:
         folder: the cache entry.
-        manifest: what was encoded and by what.
+        manifest: what was encoded and how.
         rows: (N, dim) float16 memory map; row i belongs to frame i of the dataset.
         encoded: frames encoded by the call that returned this; 0 where all were in the cache.
     """
@@ -129,7 +129,7 @@ class Features:
         """Return the features of a subset of the dataset.
 
         Args:
-            rows: (n,) rising indices of the subset's frames in the whole.
+            rows: (n,) ascending indices of the subset's frames in the whole.
             dataset: fingerprint of the subset.
         """
         contiguous = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
@@ -170,7 +170,7 @@ def encode(
         view: one of its views.
         encoder: a frozen encoder.
         cache_root: folder of the cache; `default_cache_root()` by default.
-        progress: called with (frames done, frames in all) after each chunk.
+        progress: called with (frames done, frames in total) after each chunk.
 
     Raises:
         UnknownName: a view the dataset does not have.
@@ -201,7 +201,7 @@ def encode(
 
 
 def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Features:
-    """Open a complete entry; `BadFile` where it is damaged."""
+    """Open a complete entry; `BadFile` if it is damaged."""
     try:
         manifest = _read_manifest(folder)
         rows = np.lib.format.open_memmap(folder / ROWS, mode="r")
@@ -219,7 +219,7 @@ def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Fea
 
 
 def _read_manifest(folder: Path) -> Manifest:
-    """Return the manifest of an entry; `BadFile` where it is not one of ours."""
+    """Return the manifest of an entry; `BadFile` if it is not one of ours."""
     stored = checked(read_json(folder / MANIFEST), dict, MANIFEST)
     for key, kind in MANIFEST_KINDS.items():
         checked(stored.get(key), kind, f"{MANIFEST}: {key}")
@@ -294,7 +294,7 @@ def _allocated(
 def _begun(
     folder: Path, shape: tuple[int, int]
 ) -> "tuple[np.memmap[tuple[int, int], np.dtype[np.float16]] | None, int]":
-    """Return the rows that a killed process left, and how many; None of none, or torn ones."""
+    """Return the rows that a killed process left, and how many; None if absent or torn."""
     try:
         rows = np.lib.format.open_memmap(folder / ROWS, mode="r+")
         done = int(read_json(folder / PROGRESS)["rows"])
@@ -305,10 +305,10 @@ def _begun(
 
 
 def _take_blocks(path: Path) -> None:
-    """Have every block of a file that was made at its full size.
+    """Allocate every block of a file that was created at its full size.
 
-    A block that a memory map touches and a full disk cannot give ends the process by SIGBUS, with
-    no word. macOS has no such call.
+    If a memory map touches a block that a full disk cannot provide, SIGBUS kills the process
+    without a message. macOS has no such call.
 
     Raises:
         OSError: the disk has no room for it.
@@ -341,9 +341,9 @@ class CacheEntry:
     """One entry of the cache as `list_cache` shows it.
 
     Attributes:
-        folder: where it lies.
-        size: what it takes on the disk [bytes].
-        manifest: what it holds; None where it is unfinished or damaged.
+        folder: its folder.
+        size: its size on disk [bytes].
+        manifest: what it holds; None if it is unfinished or damaged.
     """
 
     folder: Path
@@ -352,14 +352,14 @@ class CacheEntry:
 
 
 def list_cache(root: Path | None = None) -> list[CacheEntry]:
-    """List every entry, unfinished and damaged ones included; what is no folder is none."""
+    """List every entry, unfinished and damaged ones included; only folders are entries."""
     folder = (root or default_cache_root()) / "features"
     found = sorted(folder.iterdir()) if folder.is_dir() else []
     return [CacheEntry(each, _size(each), _known(each)) for each in found if each.is_dir()]
 
 
 def _size(entry: Path) -> int:
-    """Return what the files of an entry take on the disk [bytes]."""
+    """Return the size on disk of an entry's files [bytes]."""
     size = 0
     for file in entry.iterdir():
         with suppress(FileNotFoundError):  # a process that was writing here has ended
@@ -368,7 +368,7 @@ def _size(entry: Path) -> int:
 
 
 def _known(entry: Path) -> Manifest | None:
-    """Return the manifest of an entry; None where there is none, or no whole one."""
+    """Return the manifest of an entry; None if it is missing or incomplete."""
     try:
         return _read_manifest(entry)
     except BadFile:
@@ -382,7 +382,7 @@ def prune_cache(root: Path | None = None, keep_datasets: Collection[str] = ()) -
 
     Args:
         root: folder of the cache; `default_cache_root()` by default.
-        keep_datasets: fingerprints of the datasets whose whole entries stay.
+        keep_datasets: fingerprints of the datasets whose complete entries stay.
     """
     removed = []
     for entry in list_cache(root):

@@ -1,12 +1,12 @@
-"""Devices: what `--device` names, and the random numbers drawn on them; light to import.
+"""Devices: the values of `--device`, and the random states of devices; light to import.
 
-`auto` is a CUDA device where there is one, else the CPU.
+`auto` is a CUDA device if there is one, else the CPU.
 
 A computation on a GPU draws from two random states of torch, the CPU's and the GPU's:
 
     states = random_states("cuda")      # both
     …
-    set_random_states(states, "cuda")   # what is drawn next is what was drawn then
+    set_random_states(states, "cuda")   # the same numbers are drawn again
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def find_device(name: str) -> str:
 
 
 def cuda_devices(device: str | torch.device) -> list[torch.device]:
-    """Return the CUDA devices that a computation on a device draws from: none, or that one."""
+    """Return the CUDA devices whose random state a computation uses: none, or the given one."""
     import torch
 
     device = torch.device(device)
@@ -68,11 +68,11 @@ def seeded_random_states(device: str | torch.device, seed: int) -> dict[str, tor
 
 
 def set_random_states(states: Mapping[str, torch.Tensor], device: str | torch.device) -> None:
-    """Put torch's random states where `random_states` found them.
+    """Restore torch's random states to what `random_states` found.
 
     Args:
-        states: from `random_states`; of another device than this one only the CPU's is taken.
-        device: what is computed on.
+        states: from `random_states`; if they are another device's, only the CPU's is restored.
+        device: the device that computes.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""Encoders by name, imported on first use; other distributions add theirs (`core.plugins`).
+"""Encoders by name, imported on first use; other distributions can add theirs (`core.plugins`).
 
 * `encoder_names()`, `check_encoder_name(name)`, `encoder_card(name)`.
 * `WeightsSource`: where pretrained weights come from; `find_weights(name, weights)`.
@@ -27,7 +27,7 @@ _is_card = instance_of("encoders.card:EncoderCard")
 
 
 def _fault(part: object) -> str:
-    """Return what is wrong with what is offered as an encoder, "" if nothing."""
+    """Return what is wrong with an object offered as an encoder, "" if nothing."""
     if fault := _is_plugin(part):
         return fault
     plugin = cast("Plugin", part)
@@ -63,7 +63,7 @@ OPEN_ENCODERS: Mapping[str, str] = MappingProxyType({"timm:": "encoders.timm_mod
 """Prefix of open names → "module:function" that makes the plug-in of such a name."""
 
 POOLS = ("global", "spatial", "tokens")
-"""What may be taken from an encoder; a test compares this with `encoders.base`."""
+"""Outputs that may be taken from an encoder; a test compares this with `encoders.base`."""
 
 OFFLINE_ENCODERS = (
     "imagenet-lite",
@@ -80,7 +80,7 @@ def register_encoder(name: str, plugin: "Plugin", distribution: str = "") -> Non
 
     Raises:
         NameCollision: the name is taken.
-        InputError: this is no plug-in of an encoder.
+        InputError: this is not an encoder plug-in.
     """
     ENCODERS.register(name, plugin, distribution)
 
@@ -101,12 +101,12 @@ def encoder_plugin(name: str) -> "Plugin":
 
 
 def _choices() -> tuple[str, ...]:
-    """Return the registered names and the forms of the open ones."""
+    """Return the registered names and the patterns of the open ones."""
     return (*ENCODERS.names(), *(f"{prefix}<name>" for prefix in OPEN_ENCODERS))
 
 
 def check_encoder_name(name: str) -> str:
-    """Return `name` if an encoder may be called so; imports nothing."""
+    """Return `name` if it is a valid encoder name; imports nothing."""
     if not name.startswith(tuple(OPEN_ENCODERS)):
         check_name("encoder", name, _choices())
         ENCODERS.check(name)
@@ -127,12 +127,12 @@ def encoder_card(name: str) -> "EncoderCard":
 class WeightsSource:
     """Where pretrained weights come from, and whether their licence is accepted.
 
-    What no file is named for is looked for in the folder $SURGICAI_VISION_WEIGHTS, in the hub's
-    cache and by a download, in this order.
+    Weights for which no file is given are looked for in the folder $SURGICAI_VISION_WEIGHTS, then
+    in the hub's cache, and are then downloaded.
 
     Attributes:
         files: (encoder's name, its weights file) of each file given; the name is "" for the file of
-            every encoder that has none of its own.
+            every encoder that has no file given by name.
         accept_licence: accept weights under a non-commercial licence.
     """
 
@@ -141,7 +141,7 @@ class WeightsSource:
 
     @classmethod
     def parse(cls, given: Iterable[str], accept_licence: bool = False) -> "WeightsSource":
-        """Read the texts FILE and NAME=FILE; one text may hold several between commas.
+        """Parse texts of the form FILE or NAME=FILE; one may hold several, separated by commas.
 
         Raises:
             UnknownName: a NAME that no encoder has.
@@ -170,7 +170,7 @@ class WeightsSource:
         return cls(() if file is None else (("", Path(file)),), accept_licence)
 
     def file_for(self, encoder: str) -> Path | None:
-        """Return the file that is meant for `encoder`, or None where no file is named for it."""
+        """Return the file that is meant for `encoder`, or None if no file is given for it."""
         files = dict(self.files)
         return files.get(encoder, files.get(""))
 
@@ -185,7 +185,7 @@ def load_encoder(
     weights: WeightsSource = ANYWHERE,
     device: str = AUTO,
 ) -> "Encoder":
-    """Load an encoder by name, frozen for good.
+    """Load an encoder by name, permanently frozen.
 
     Args:
         name: one of `encoder_names()`.
@@ -195,8 +195,8 @@ def load_encoder(
 
     Raises:
         UnknownName: a name or pool that does not exist.
-        InputError: a device that is not there, or an encoder of another distribution that fails,
-            builds something else or gives features of another length than its card says.
+        InputError: a device that is not available, or an encoder from another distribution that
+            fails, builds something else or returns features of a length other than its card's.
         MissingWeights: the weights are found nowhere; raised within seconds and before any work.
         BadFile: a weights file that is missing, damaged or of another architecture.
     """
@@ -208,7 +208,7 @@ def load_encoder(
     with ENCODERS.calling(name):
         built: object = plugin.build(plugin.card, path)
     card, network = _built(name, built)
-    with ENCODERS.calling(name):  # it is asked for a first feature
+    with ENCODERS.calling(name):  # this computes a first feature
         encoder: Encoder = make(card, network, pool, where)
     if pool == "global" and encoder.shape != (card.dim,):
         raise ENCODERS.refusal(
@@ -220,7 +220,7 @@ def load_encoder(
 
 
 def _built(name: str, built: object) -> "tuple[EncoderCard, nn.Module]":
-    """Return the card and the network that an encoder's `build` has answered, or refuse them."""
+    """Return the card and the network that an encoder's `build` returned, or refuse them."""
     wrong = "builds {}; its build must return its card and a torch.nn.Module"
     if not isinstance(built, tuple) or len(built) != 2:
         raise ENCODERS.refusal(name, wrong.format(shown(built)))

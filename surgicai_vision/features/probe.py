@@ -6,14 +6,14 @@ fitted on.
 
 Every episode is held out once (`FOLDS` folds of whole episodes). Each penalty is chosen on the
 other episodes alone, by cross-validation over folds of whole episodes among them. At most `FRAMES`
-frames are used, evenly spread over every episode: neighbouring frames say nearly the same. An
-orientation is fitted as two columns of its matrix and put back among the rotations (Gram–Schmidt).
-An episode's error is the median over its frames; reported is the median over episodes, with a
-percentile bootstrap over episodes. `chance` is the error of the mean pose of the episodes fitted
-on.
+frames are used, evenly spread over every episode: neighbouring frames show nearly the same. An
+orientation is fitted as two columns of its matrix and turned back into a rotation (Gram–Schmidt).
+An episode's error is the median over its frames; the reported error is the median over episodes,
+with a percentile bootstrap over episodes. `chance` is the error of the mean pose of the episodes
+fitted on.
 
-A crop shows where the needle is beside the jaws, not where it is in the world. With
-`proprioception` the active arm's reported tip pose and jaw are read as well, as a policy has them.
+A crop shows where the needle is relative to the jaws, not where it is in the world. With
+`proprioception` the active arm's reported tip pose and jaw are inputs as well, as for a policy.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ FRAMES = 1000
 FEWEST = 5  # episodes: fewer leave no episodes to choose a penalty on
 PENALTIES = np.logspace(-7, 2, 28)
 """Tried penalties, as shares of the features' total variance."""
-SMALLEST_STD = 1e-6  # a feature that varies less is constant
+SMALLEST_STD = 1e-6  # a feature that varies less counts as constant
 RESAMPLES = 10_000
 
 Array = NDArray[np.float64]
@@ -53,15 +53,15 @@ class Measure:
 
 @dataclass(frozen=True)
 class Probe:
-    """What a probe found.
+    """The result of a probe.
 
     Attributes:
         tip: error of the tip's position in the world [mm].
-        angle: angle between the needle's orientation and the one read [deg].
-        n: episodes.
-        frames: frames used.
+        angle: angle between the needle's orientation and the predicted one [deg].
+        n: number of episodes.
+        frames: number of frames used.
         tip_of_episode: (n,) median error of each episode [mm].
-        angle_of_episode: (n,) the same [deg].
+        angle_of_episode: (n,) median angle of each episode [deg].
     """
 
     tip: Measure
@@ -90,14 +90,14 @@ def probe(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Probe:
-    """Probe the features of one or several views side by side.
+    """Probe the features of one or several views, concatenated.
 
     Args:
         dataset: an opened dataset.
         features: one entry of the cache per view; none to probe proprioception alone.
-        proprioception: read the active arm's reported tip pose and jaw beside the features.
-        seed: of the folds and of the bootstrap.
-        progress: called with (folds done, folds in all).
+        proprioception: also use the active arm's reported tip pose and jaw as inputs.
+        seed: seed of the folds and of the bootstrap.
+        progress: called with (folds done, folds in total).
 
     Raises:
         UnknownName: a dataset without the needle's pose.
@@ -120,7 +120,7 @@ def probe(
     if proprioception:
         tables.append(np.asarray(dataset.columns()[names.STATE][rows], np.float64))
     scale = np.sqrt(max(table.shape[1] for table in tables))
-    # Every table weighs as much as another, however many columns it has.
+    # All tables have the same weight, however many columns they have.
     weights = np.concatenate(
         [np.full(table.shape[1], scale / np.sqrt(table.shape[1])) for table in tables]
     )
@@ -154,7 +154,7 @@ def probe(
 def spread(episode_index: NDArray[np.int64], frames: int) -> NDArray[np.int64]:
     """Return at most `frames` row numbers, evenly spread over every episode.
 
-    Every episode gives equally many, a shorter one all it has.
+    Every episode contributes equally many; a shorter one contributes all its rows.
     """
     episodes = np.unique(episode_index)
     each = max(1, frames // len(episodes))
@@ -214,7 +214,7 @@ def _matrices(columns: Array) -> Array:
 def _folds(
     episode: NDArray[np.int64], count: int, generator: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Return the fold of each row; whole episodes, evenly many a fold."""
+    """Return the fold of each row; folds hold whole episodes, equally many each."""
     episodes, place = np.unique(episode, return_inverse=True)
     return (generator.permutation(len(episodes)) % count)[place]
 
@@ -222,13 +222,13 @@ def _folds(
 class _Reader:
     """Ridge regression from one table of features, in its dual form.
 
-    Frames are fewer than features.
+    There are fewer frames than features.
 
     Args:
-        fitted: features of the rows fitted, (n, d).
-        asked: features of the rows asked, (m, d).
-        folds: fold of each row fitted, to choose a penalty on.
-        weights: what each feature's standard deviation becomes, (d,).
+        fitted: features of the rows fitted on, (n, d).
+        asked: features of the rows to predict, (m, d).
+        folds: fold of each row fitted on, for choosing a penalty.
+        weights: standard deviation to which each feature is scaled, (d,).
     """
 
     def __init__(
@@ -248,11 +248,11 @@ class _Reader:
         self._asked = len(asked)
 
     def mean(self, target: Array) -> Array:
-        """Return the answers that need no features, (m, k) for targets (n, k)."""
+        """Return the mean target as every answer, (m, k) for targets (n, k)."""
         return np.broadcast_to(target.mean(0), (self._asked, target.shape[1]))
 
     def answer(self, target: Array) -> Array:
-        """Return the answers (m, k) for targets (n, k), with the penalty best across the folds."""
+        """Return the answers (m, k) for targets (n, k), with the best penalty across the folds."""
         errors = np.zeros(len(PENALTIES))
         for held, ridge in self._parts:
             for at, penalty in enumerate(PENALTIES):
@@ -264,8 +264,8 @@ class _Ridge:
     """One eigendecomposition, from which ridge regression with any penalty follows.
 
     Args:
-        gram: (n, n) products of the rows fitted.
-        cross: (m, n) products of the rows asked with those fitted.
+        gram: (n, n) dot products of the rows fitted on.
+        cross: (m, n) dot products of the rows to predict with those fitted on.
     """
 
     def __init__(self, gram: Array, cross: Array) -> None:
@@ -282,7 +282,7 @@ class _Ridge:
         """Return the answers (m, k) for targets (n, k).
 
         Args:
-            target: what is to be read.
+            target: the targets of the rows fitted on.
             penalty: a share of the features' total variance.
         """
         mean = target.mean(0)
@@ -294,7 +294,7 @@ class _Ridge:
 def _measure(
     errors: Array, episode: NDArray[np.int64], generator: np.random.Generator
 ) -> tuple[Measure, Array]:
-    """Return the measure of (2, n) errors, read and chance, and each episode's median error."""
+    """Return the measure of (2, n) errors, probe and chance, and each episode's median error."""
     of_episode = np.array(
         [np.median(errors[:, episode == one], axis=1) for one in np.unique(episode)]
     )

@@ -1,9 +1,9 @@
 """Report: stored results → one self-contained page and tables.
 
-A results folder holds evaluations (`storage.find_evaluations`) anywhere below it and, where a run
-wrote it, `run.json`: its title, command, stages with their seconds, versions and machine. A sweep's
-runs without a result are in the report too, with the reason. Images are rendered anew from the
-states kept of each episode, so results stay small and the page can be rebuilt at any time.
+A results folder holds evaluations (`storage.find_evaluations`) at any depth. It may also hold the
+`run.json` of a run: title, command, seconds of each stage, versions and machine. The report
+includes a sweep's runs without a result, with the reason. Images are rendered again from the states
+kept of each episode, so results stay small and the page can be rebuilt at any time.
 
     reader → groups (over training seeds) → pairs, curves, films → page, tables
 """
@@ -55,13 +55,13 @@ def write_report(
 
     Args:
         folder: results of quickstart, evaluate, robustness or sweep.
-        out: the page, by default `folder`/report.html; `tables/` stands beside it.
+        out: the page, by default `folder`/report.html; `tables/` is written next to it.
         progress: called as progress(parts done, parts).
         planned: the runs of a sweep (see `reader.collect`).
-        strips: film strips at most; 0 leaves the episodes' strips out.
+        strips: maximum number of film strips; 0 for none.
 
     Raises:
-        BadFile: a folder without a whole evaluation and without a cell that failed or was not run.
+        BadFile: the folder has neither a complete evaluation nor a cell that failed or was not run.
     """
     report = progress or silent
     collected = collect(folder, planned)

@@ -1,12 +1,12 @@
 """Aggregates over tasks and training seeds, after Agarwal et al. 2021.
 
 "Deep reinforcement learning at the edge of the statistical precipice" (NeurIPS 2021,
-arXiv:2108.13264), whose library is rliable: the interquartile mean of a method's runs, and the
-probability that a run of one method does better than a run of another on the same task, both with
-percentile intervals of a bootstrap that draws runs within each task.
+arXiv:2108.13264), whose library is rliable. The aggregates are the interquartile mean of a method's
+runs, and the probability that a run of one method does better than a run of another on the same
+task. Both have percentile intervals from a bootstrap that draws runs within each task.
 
-`Scores` are success rates: for each task those of its training seeds. Tasks may differ in their
-number of seeds.
+`Scores` are success rates: for each task, one per training seed. Tasks may differ in their number
+of seeds.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,16 +18,16 @@ from surgicai_vision.core.errors import InputError
 
 Scores = Sequence[Sequence[float]]
 RESAMPLES = 2000
-"""rliable's own number is 50,000; 2,000 place a percentile to about a hundredth."""
+"""rliable's default is 50,000; 2,000 determine a percentile to about a hundredth."""
 TAIL = 0.25
-"""Share of the runs that is left out at each end."""
+"""Share of the runs left out at each end."""
 
 
 def interquartile_mean(scores: Scores) -> float:
     """Return the mean of the middle half of all runs, whatever their task.
 
-    As rliable takes it (`scipy.stats.trim_mean`): a quarter of the runs, rounded down, is left out
-    at each end.
+    As in rliable (`scipy.stats.trim_mean`), a quarter of the runs, rounded down, is left out at
+    each end.
     """
     runs = np.sort(np.concatenate([np.asarray(task, np.float64) for task in _checked(scores)]))
     cut = int(TAIL * len(runs))
@@ -35,13 +35,13 @@ def interquartile_mean(scores: Scores) -> float:
 
 
 def probability_of_improvement(first: Scores, second: Scores) -> float:
-    """Return how probably a run of `first` beats one of `second` on the same task.
+    """Return the probability that a run of `first` beats one of `second` on the same task.
 
-    The mean over tasks of the share of pairs of runs in which the first is better, ties counted by
+    It is the mean over tasks of the share of pairs of runs in which the first is better; ties count
     half (Mann and Whitney's U over the number of pairs).
 
     Raises:
-        InputError: other numbers of tasks.
+        InputError: the two differ in their number of tasks.
     """
     if len(first) != len(second):
         raise InputError(f"{len(first)} tasks beside {len(second)}; give the same tasks of both.")
@@ -66,7 +66,7 @@ def bootstrap(
         scores: its arguments.
         generator: draws the runs, with replacement, within each task and method.
         level: coverage, between 0 and 1.
-        resamples: how often.
+        resamples: number of bootstrap resamples.
     """
     values: NDArray[np.float64] = np.empty(resamples)
     for index in range(resamples):

@@ -1,7 +1,7 @@
 """Charts: small SVG drawings with their intervals visible, safe for the colour-blind.
 
-Series have Okabe and Ito's colours and a marker of their own, so that no chart rests on colour
-alone. Colours of text and axes come from the page's style sheet.
+Each series has one of Okabe and Ito's colours and its own marker, so that no chart relies on colour
+alone. The colours of text and axes come from the page's style sheet.
 """
 
 import math
@@ -40,16 +40,16 @@ TOP = 10
 BOTTOM = 40
 """Size and margins of a curve's drawing, in its own units."""
 FEW_MARKS = 8
-"""Numbers that have room below a curve's axis."""
+"""How many numbers fit below a curve's axis."""
 NAMES = 104
 BAR = 20
-"""Width of the names beside bars, and height of a bar with its gap."""
+"""Width of the names next to bars, and height of a bar including its gap."""
 BAR_COLOUR = COLOURS[5]
 
 
 @dataclass(frozen=True)
 class Point:
-    """A success rate at x, with its interval and the words a reader hears."""
+    """A success rate at x, with its interval and its text for tooltips and screen readers."""
 
     x: float
     rate: float
@@ -68,7 +68,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Bar:
-    """A share with another one and its bounds beside it, and the words a reader hears."""
+    """A share, optionally a second one with its bounds, and the text as in `Point`."""
 
     name: str
     share: float
@@ -77,7 +77,7 @@ class Bar:
 
 
 def bars(rows: Sequence[Bar], label: str) -> Markup:
-    """Draw shares as bars on an axis from 0 to 1; what is beyond 1.1 is cut.
+    """Draw shares as bars on an axis from 0 to 1; values beyond 1.1 are cut off.
 
     Args:
         rows: from top to bottom.
@@ -115,7 +115,7 @@ def bars(rows: Sequence[Bar], label: str) -> Markup:
 
 
 def heat(rate: float) -> tuple[str, str]:
-    """Return background and text colour of a rate."""
+    """Return the background and text colours of a rate."""
     at = min(max(rate, 0.0), 1.0) * (len(_HEAT) - 1)
     low = min(int(at), len(_HEAT) - 2)
     share = at - low
@@ -145,7 +145,7 @@ def interval(
 ) -> Markup:
     """Draw a rate with its interval on an axis from 0 to 1.
 
-    Below it the paper's rate and interval, where it has one.
+    The paper's rate and interval, if it has one, are drawn below.
 
     Args:
         rate: ours.
@@ -202,15 +202,15 @@ def curves(
     ticks: Mapping[float, str] | None = None,
     joined: bool = True,
 ) -> Markup:
-    """Draw success against x, one line a series, intervals as bars at the points.
+    """Draw success against x, one line per series, with intervals as bars at the points.
 
     Args:
-        series: the lines; each has an x of its own for every point. One without points keeps the
-            colour of its place from the others.
+        series: the lines, each with its own x values. A series without points is not drawn, but
+            no other series gets its colour.
         x_name: what x is.
-        logarithmic: a logarithmic axis; every x above 0.
+        logarithmic: use a logarithmic axis; every x must be above 0.
         label: what a screen reader says.
-        ticks: x → its word, where it is no number.
+        ticks: x → its label, if that is not the number.
         joined: draw a line through the points of a series.
     """
     xs = sorted({point.x for line in series for point in line.points})
@@ -255,9 +255,9 @@ def key(series: Sequence[Series]) -> Markup:
 
 
 def _marks(xs: Sequence[float]) -> list[float]:
-    """Return where a linear axis is marked: at every x, or at round numbers where these are many.
+    """Return where a linear axis is marked: at every x, or at round numbers if not all x fit.
 
-    Numbers are many, too, where they have more digits than fit below the axis.
+    They do not fit if there are too many, or if one has too many digits.
     """
     if len(xs) == 1 or (len(xs) <= FEW_MARKS and all(len(f"{x:g}") <= 4 for x in xs)):
         return list(xs)
@@ -300,7 +300,7 @@ def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float,
 def _line(line: Series, index: int, shift: float, place: object, with_path: bool) -> str:
     """Draw one series.
 
-    `shift` moves it sideways, so that intervals at one x stand beside each other.
+    `shift` moves it sideways, so that intervals at the same x do not overlap.
     """
     assert callable(place)
     colour = COLOURS[index % len(COLOURS)]

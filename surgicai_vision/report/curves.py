@@ -1,4 +1,4 @@
-"""Curves: success against demonstrations, training and a shift's strength; over the procedure."""
+"""Curves: success against demonstrations, training and shift strength, and over the procedure."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.groups import Group
 
 MOST = len(charts.COLOURS)
-"""Series in one drawing; what is beyond stands in the table alone."""
+"""Most series in one drawing; any further ones are only in the table."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Chart:
 
 
 def data_curves(groups: Sequence[Group]) -> list[Chart]:
-    """Return success against the number of demonstrations, one chart a task with several."""
+    """Return success against the number of demonstrations, one chart per task with several."""
     return _curves_along(
         [item for item in groups if item.condition.demonstrations],
         lambda item: float(item.condition.demonstrations or 0),
@@ -41,7 +41,7 @@ def data_curves(groups: Sequence[Group]) -> list[Chart]:
 
 
 def budget_curves(groups: Sequence[Group]) -> list[Chart]:
-    """Return success against the minutes of training, one chart a task with several budgets."""
+    """Return success against the minutes of training, one chart per task with several budgets."""
     return _curves_along(
         [item for item in groups if item.condition.minutes],
         lambda item: item.condition.minutes or 0.0,
@@ -58,7 +58,7 @@ def _curves_along(
     *,
     logarithmic: bool = False,
 ) -> list[Chart]:
-    """Return a chart for each task in which plain evaluations differ by `x` and nothing else."""
+    """Return a chart for each task in which plain evaluations differ in `x` and nothing else."""
     found = []
     for task in task_names():
         mine = [item for item in groups if evaluated(item, task) and item.condition.plain]
@@ -69,9 +69,9 @@ def _curves_along(
 
 
 def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
-    """Success against the strength of each shift, with the area under the curve.
+    """Return success against the strength of each shift, with the area under the curve.
 
-    One chart a task and axis.
+    There is one chart per task and axis.
     """
     found = []
     for task in task_names():
@@ -93,7 +93,7 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
 def with_zero(groups: Sequence[Group], axis: str) -> list[Group]:
     """Return the evaluations of one axis.
 
-    An evaluation without a shift is strength 0 where none was made.
+    An evaluation without a shift serves as strength 0 if none was made at that strength.
     """
     of_axis = [item for item in groups if item.condition.axis == axis]
     lacking = {base_of(item) for item in of_axis} - {
@@ -108,9 +108,9 @@ def base_of(item: Group) -> Condition:
 
 
 def _area(items: Sequence[Group]) -> str:
-    """Return the area under a curve, with an interval where every strength had the same starts.
+    """Return the area under a curve, with an interval if every strength had the same starts.
 
-    The area is linear in the successes: its mean over the starts' own areas is the curve's.
+    The area is linear in the successes: the mean of the starts' own areas is the curve's area.
     """
     ordered = sorted(items, key=lambda item: item.condition.strength)
     strengths = [item.condition.strength for item in ordered]
@@ -133,7 +133,7 @@ def _area(items: Sequence[Group]) -> str:
 def _by_condition(
     groups: Sequence[Group], same: Callable[[Group], Condition]
 ) -> dict[Condition, list[Group]]:
-    """Gather the groups that are the `same` but for what the curve runs along."""
+    """Collect the groups that are the `same` except for the x of the curve."""
     found: dict[Condition, list[Group]] = {}
     for item in groups:
         found.setdefault(same(item), []).append(item)
@@ -141,7 +141,7 @@ def _by_condition(
 
 
 def _series(members: dict[Condition, list[Group]], x: Callable[[Group], float]) -> list[Series]:
-    """Join groups into lines; a single point is no curve."""
+    """Join groups into lines; a single point is not a curve."""
     found = []
     for condition, items in members.items():
         points = tuple(_point(x(item), item) for item in sorted(items, key=x))
@@ -221,7 +221,7 @@ def procedure(groups: Sequence[Group]) -> Chart | None:
 
 
 def evaluated(item: Group, task: str, trained: bool = True) -> bool:
-    """Return True for an evaluation of a task, by a trained policy if so asked."""
+    """Return True for an evaluation of a task; with `trained`, only for one of a trained policy."""
     return bool(
         item.episodes and item.condition.task == task and (item.condition.trained or not trained)
     )

@@ -53,15 +53,15 @@ def film_id(identity: tuple[str, int]) -> str:
 def group_details(
     item: Group, reel: Reel, commands: dict[str, list[str]], on_page: set[tuple[str, int]]
 ) -> dict[str, object]:
-    """Return one condition.
+    """Return the details of one condition.
 
-    Its cells with their episodes, its films, what was measured, what is missing.
+    They are its cells with their episodes, its films, what was measured and what is missing.
 
     Args:
         item: the condition.
         reel: all strips of the page.
-        commands: folder of a result → the commands that make its number again.
-        on_page: episodes whose frames stand in the page itself; here they are only named.
+        commands: folder of a result → the commands that reproduce its number.
+        on_page: episodes whose frames are in the page already; here they are only named.
     """
     films = []
     for index, result in enumerate(item.results):
@@ -105,7 +105,7 @@ def _cell(result: Result, commands: Sequence[str]) -> dict[str, object]:
 
 
 def _starts(seeds: Sequence[int]) -> int | list[int]:
-    """Return the first of starts that follow each other, else all of them."""
+    """Return the first start if they are consecutive, else all of them."""
     in_a_row = list(seeds) == list(range(seeds[0], seeds[0] + len(seeds)))
     return seeds[0] if in_a_row else list(seeds)
 

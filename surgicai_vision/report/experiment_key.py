@@ -1,4 +1,4 @@
-"""The key of an experiment: what was evaluated, but for the training seed."""
+"""The key of an experiment: what was evaluated, except for the training seed."""
 
 import re
 from dataclasses import dataclass, replace
@@ -11,41 +11,41 @@ from surgicai_vision.core.tasks import task_names
 from surgicai_vision.training.run_config import BUDGET, RunConfig
 
 USUAL = "the usual world"
-"""A world in which nothing varies, in words."""
+"""The name of a world in which nothing varies."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What was evaluated, but for the training seed.
+    """What was evaluated, except for the training seed.
 
     Attributes:
         task: one of `names.TASKS`.
-        encoder: the encoder; without one "proprioception" or "state", or the name of the
+        encoder: the encoder; without one, "proprioception" or "state", or the name of the
             hierarchical policy or reference.
-        views: its views.
+        views: the policy's views.
         hierarchical: how subtasks end under a hierarchical policy, or "".
         trained_by: the policy's kind.
         pool: what is taken from the encoder.
-        recipe: its recipe's name.
+        recipe: the recipe's name.
         changes: what is changed in the recipe.
-        acted_by: what of the recipe is changed in the evaluation alone.
-        demonstrations: demonstrations trained on, validation included; None where not known.
+        acted_by: what is changed in the recipe for the evaluation only.
+        demonstrations: demonstrations trained on, validation included; None if not known.
         looks: the looks in which each demonstration was rendered, or "".
-        multiplied_from: how many demonstrations those were re-posed from; None where they were not.
-        dagger_rounds: rounds of DAgger that those hold.
-        world: what is not as usual in the world of the evaluation, before a shift; "" where nothing
-            is.
-        recorded_in: the same of the demonstrations' world, where it is another; else "", and of a
-            hierarchical policy, whose parts have each their own.
+        multiplied_from: how many demonstrations those were re-posed from; None if they were not.
+        dagger_rounds: rounds of DAgger that those include.
+        world: what differs from the usual in the world of the evaluation, before a shift; "" if
+            nothing does.
+        recorded_in: the same for the demonstrations' world, if it is a different one; else "". Also
+            "" for a hierarchical policy, each of whose parts has its own.
         axis: what is shifted in a robustness evaluation, or "".
-        strength: how much.
+        strength: how much it is shifted.
         expert_swap: subtask of a hierarchical policy in which the expert acts, or "".
-        upset: whether one thing went wrong in every episode.
-        name: name of the condition of a plan, or "".
+        upset: whether one thing went wrong on purpose in every episode.
+        name: name of the condition in a plan, or "".
         trained: whether a policy was trained.
-        starts: what the starts are to a policy (`core.banks`).
-        place: where it stands, if another evaluation of the same condition and training seed stands
-            elsewhere.
+        starts: the bank that the starts are from (`core.banks`).
+        place: where it is stored, if another evaluation of the same condition and training seed is
+            stored elsewhere.
     """
 
     task: str
@@ -74,10 +74,10 @@ class Condition:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The encoder, then everything that is not as usual: not bc, global, paper.
+        """The encoder, then everything unusual: what is not bc, global, paper.
 
-        Inputs and demonstrations are left out. A recipe that is named as the policy's kind is not
-        said a second time.
+        Inputs and demonstrations are left out. A recipe with the same name as the policy's kind is
+        not repeated.
         """
         usual = ((self.trained_by, "bc"), (self.pool, "global"), (self.recipe, "paper"))
         parts = (
@@ -99,12 +99,12 @@ class Condition:
 
     @property
     def is_held_out(self) -> bool:
-        """Whether it was counted on starts that nothing of the policy has met."""
+        """Whether it was evaluated on starts that no part of the policy has met."""
         return self.starts == HELD_OUT
 
     @property
     def variant(self) -> str:
-        """Everything that is not as usual, but for encoder, inputs and demonstrations."""
+        """Everything unusual, except for encoder, inputs and demonstrations."""
         return " · ".join(self.parts[1:])
 
     @property
@@ -114,7 +114,7 @@ class Condition:
 
     @property
     def learned_in(self) -> str:
-        """What is not as usual where it was demonstrated; "" for a hierarchy of several worlds."""
+        """What differs from the usual in the demonstrations' world; "" if it is hierarchical."""
         return "" if self.hierarchical else self.recorded_in or self.world or USUAL
 
     @property
@@ -124,7 +124,7 @@ class Condition:
 
     @property
     def label(self) -> str:
-        """The policy with everything that tells it from its neighbours, but for the task."""
+        """The policy with everything that distinguishes it from others, except for the task."""
         parts = [self.policy + (f" on {self.view}" if self.views else "")]
         parts += [f"{self.axis} {self.strength:g}"] if self.axis else []
         parts += [f"expert in {self.expert_swap}"] if self.expert_swap else []
@@ -138,13 +138,13 @@ class Condition:
 
     @property
     def minutes(self) -> float | None:
-        """What its training was allowed on one core [min]; None where it was given no budget."""
+        """Its training budget on one core [min]; None if it had none."""
         minutes = read_changes(self.changes).get(BUDGET)
         return float(minutes) if isinstance(minutes, int | float) else None
 
     @property
     def without_budget(self) -> "Condition":
-        """The condition but for the budget of its training."""
+        """The condition without the budget of its training."""
         kept = tuple(change for change in self.changes if BUDGET not in read_changes([change]))
         return replace(self, changes=kept)
 
@@ -154,7 +154,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
 
     Args:
         run: the run.
-        place: where its evaluation stands, if another one of the same run stands elsewhere.
+        place: where its evaluation is stored, if another one of the same run is stored elsewhere.
     """
     encoder = run.encoder or run.inputs
     if not run.is_trained:
@@ -188,9 +188,9 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
 
 
 def _worlds(run: RunConfig) -> dict[str, str]:
-    """Return a condition's `world` and `recorded_in`; what is shifted is so from where it learned.
+    """Return a condition's `world` and `recorded_in`; a shift is added to the world it learned in.
 
-    An evaluation of an earlier version may not say what a shift was added to.
+    An evaluation by an earlier version may not say what a shift was added to.
     """
     learned = world_text(run.recorded_in) if run.recorded_in else ""
     if run.shift:
@@ -206,10 +206,11 @@ type Order = tuple[int, bool, bool, Text, int, list[int], Text, int, str, float,
 
 
 def order(condition: Condition) -> Order:
-    """Return the place of a condition in tables.
+    """Return the sort key of a condition in tables.
 
-    By task; in it trained policies first, by encoder, views and what else they are, then the
-    references. Numbers in names are ordered by what they are worth: 3 minutes before 10.
+    Conditions are ordered by task. Within a task trained policies come first, by encoder, views and
+    everything else, then the references. Numbers in names are ordered by value: 3 minutes before
+    10.
     """
     known = view_names()
     views = [known.index(view) if view in known else len(known) for view in condition.views]
@@ -232,6 +233,6 @@ def order(condition: Condition) -> Order:
 
 
 def _by_number(text: str) -> Text:
-    """Return a text's pieces, each as what stands before a number, and the number."""
+    """Return a text's pieces, each as the text before a number, and the number."""
     pieces = re.findall(r"(\D*)(\d+(?:\.\d+)?|$)", text)
     return tuple((before, float(number or 0)) for before, number in pieces)

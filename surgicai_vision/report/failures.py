@@ -1,4 +1,4 @@
-"""Failures: one image of how the best policies fail, for a paper or a README: a film strip each."""
+"""Failures: one image of how the best policies fail, in film strips, for a paper or a README."""
 
 import base64
 import io
@@ -10,17 +10,17 @@ from surgicai_vision.report.filmstrips import Reel, Strip
 from surgicai_vision.report.groups import Group, best_trained, of_task
 
 MOST = 8
-"""Strips of the image at most."""
+"""Most strips in the image."""
 DOTS = 60
 QUALITY = 80
-"""Dots per inch, of 2.1 inches a frame, and JPEG quality: eight strips stay below 300 kB."""
+"""Dots per inch, at 2.1 inches per frame, and JPEG quality: eight strips stay below 300 kB."""
 
 
 def failure_sheet(groups: Sequence[Group], reel: Reel) -> bytes | None:
-    """Return a JPEG with failures of the best policy of each task; None without a strip.
+    """Return a JPEG with failures of the best policy of each task; None if there is no strip.
 
-    Each kind of failure stands once, in the view of its strip; frames are evenly spaced over the
-    episode.
+    Each kind of failure appears once per task, in the view of its strip; frames are evenly spaced
+    over the episode.
     """
     strips = list(_failures(groups, reel))[:MOST]
     if not strips:
@@ -34,7 +34,7 @@ def failure_sheet(groups: Sequence[Group], reel: Reel) -> bytes | None:
 
 
 def _failures(groups: Sequence[Group], reel: Reel) -> Iterator[Strip]:
-    """Yield the strips of failures that were rendered, task by task."""
+    """Yield the rendered strips of failures, task by task."""
     for task in task_names():
         best = best_trained(of_task(groups, task))
         seen = set()
@@ -50,6 +50,6 @@ def _title(strip: Strip) -> str:
 
 
 def _frames(strip: Strip, count: int) -> list[contact_sheet.Image]:
-    """Return the strip's frames, the last again where it has fewer than `count`."""
+    """Return the strip's frames; repeat the last if it has fewer than `count`."""
     frames = [contact_sheet.decoded(base64.b64decode(frame)) for frame in strip.frames]
     return [*frames, *[frames[-1]] * (count - len(frames))]

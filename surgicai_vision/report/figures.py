@@ -1,4 +1,4 @@
-"""Show: the page's static images.
+"""Figures: the page's static images.
 
 What each view sees, a success and a failure, rollouts side by side.
 """
@@ -63,7 +63,7 @@ def static_images(groups: Sequence[Group], reel: Reel) -> dict[str, object]:
 def choose(groups: Sequence[Group], success: bool) -> Choice | None:
     """Choose the episode for a film.
 
-    The best trained policy's first, else another's, references last.
+    It is the best trained policy's first one, else another policy's; references come last.
     """
     best = best_trained(groups)
     ordered = sorted(groups, key=lambda item: (item is not best, not item.condition.trained))

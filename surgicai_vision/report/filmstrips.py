@@ -1,9 +1,8 @@
 """Films: which episodes are shown, and their strips, within the page's budget.
 
-A strip is a few frames of one episode as small JPEGs, rendered anew from the states kept. Episodes
-are chosen in rounds, so that a page that may hold few strips still shows every policy: first each
-task's compared start, then a success and a failure of each condition, then a failure of another
-kind.
+A strip is a few frames of one episode as small JPEGs, rendered again from the states kept. Episodes
+are chosen in rounds, so that even a page with few strips shows every policy: first each task's
+compared start, then a success and a failure of each condition, then the other kinds of failure.
 """
 
 import base64
@@ -27,14 +26,14 @@ SIZE = 128
 QUALITY = 72
 """Frames of a strip, their height and width [px] and their JPEG quality."""
 BUDGET = 4_000_000
-"""Characters of base64 that all strips together may take: with the rest the page stays below 8
+"""Characters of base64 that all strips together may take: with the rest, the page stays below 8
 MB.
 """
 WHOLE_VIEW = "front"
-"""View in which whole procedures are shown: a crop about one arm misses what the other one does."""
+"""View in which whole procedures are shown: a crop around one arm misses what the other does."""
 MOST_STRIPS = 160
 COMPARED = 5
-"""Policies whose rollouts from one start stand beside each other."""
+"""Policies whose rollouts from one start are shown side by side."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +46,12 @@ class Choice:
 
     @property
     def identity(self) -> tuple[str, int]:
-        """What tells the episode from all others."""
+        """What distinguishes the episode from all others."""
         return str(self.result.folder), self.row["seed"]
 
     @property
     def view(self) -> str:
-        """The view it is shown in: the policy's first, for whole procedures `WHOLE_VIEW`."""
+        """The view it is shown in: the policy's first, or `WHOLE_VIEW` for whole procedures."""
         condition = self.group.condition
         seen = () if condition.task == names.SUTURE else condition.views
         return next(iter(seen), WHOLE_VIEW)
@@ -82,9 +81,9 @@ class Reel:
     """All strips of a page.
 
     Attributes:
-        strips: by the episode's identity.
-        compared: task → the identities of one start's rollouts.
-        wanted: how many episodes were asked for.
+        strips: an episode's identity → its strip.
+        compared: task → the rollouts from one start.
+        wanted: how many episodes are worth a strip.
         problem: why there are no images, or "".
     """
 
@@ -97,11 +96,11 @@ class Reel:
 def make_reel(
     groups: Sequence[Group], most: int = MOST_STRIPS, progress: Callable[..., None] | None = None
 ) -> Reel:
-    """Choose and render.
+    """Choose episodes and render their strips.
 
     Args:
         groups: the conditions of the page.
-        most: strips at most; 0 renders nothing.
+        most: maximum number of strips; 0 renders nothing.
         progress: called as progress(strips done, strips).
     """
     reel = Reel(
@@ -152,7 +151,7 @@ def comparison(groups: Sequence[Group], task: str) -> list[Choice]:
 
 
 def _wanted(groups: Sequence[Group], compared: dict[str, list[Choice]]) -> Iterator[Choice]:
-    """Yield every episode worth a strip, the most wanted first."""
+    """Yield every episode worth a strip, in order of priority."""
     for choices in compared.values():
         yield from choices
     kinds: list[Callable[[dict[str, Any]], bool]] = [
@@ -180,7 +179,7 @@ def _first(item: Group, wish: Callable[[dict[str, Any]], bool]) -> Iterator[Choi
 
 
 def _render(choices: Sequence[Choice]) -> Iterator[Strip]:
-    """Render strips; those of one scene together, since making one costs more than a strip."""
+    """Render strips; those of one scene together, since making a scene costs more than a strip."""
     scenes: dict[str, list[Choice]] = {}
     for choice in choices:
         scenes.setdefault(repr(sorted(to_mapping(choice.result.config).items())), []).append(choice)
@@ -193,7 +192,7 @@ def _render(choices: Sequence[Choice]) -> Iterator[Strip]:
 
 
 def _strip(choice: Choice, image: contact_sheet.Draw) -> Strip | None:
-    """Render one episode in its view; None where no state of it was kept."""
+    """Render one episode in its view; None if none of its states were kept."""
     view = choice.view
     film = read_film(choice.result.folder, choice.row["seed"])
     if not len(film.steps):

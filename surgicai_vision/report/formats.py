@@ -135,7 +135,7 @@ def _paired(
 
 
 def _escaped(words: str) -> str:
-    """Return one line that Markdown takes as text in a table."""
+    """Return one line that Markdown reads as plain text in a table."""
     return re.sub(r"([|\\*_`<\[])", r"\\\1", " ".join(words.split()))
 
 
@@ -152,7 +152,7 @@ def _latex_row(row: Sequence[str]) -> str:
 def _latex_table(
     columns: str, head: Sequence[str], rows: Sequence[Sequence[str]], caption: str, label: str
 ) -> list[str]:
-    """Return one floating table; a thin rule between tasks."""
+    """Return one floating table, with extra space between tasks."""
     body: list[str] = []
     for index, row in enumerate(rows):
         if index and row[0] != rows[index - 1][0]:

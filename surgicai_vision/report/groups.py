@@ -1,8 +1,8 @@
-"""Groups: the cells that differ by nothing but their training seed, counted together.
+"""Groups: the cells that differ only in their training seed, pooled.
 
-Episodes of one cell: k/n with the exact (Clopper–Pearson) interval. Over several training seeds:
-mean ± standard deviation of the cells' rates, and a hierarchical bootstrap interval (training
-seeds, then episodes).
+Episodes of all cells together: k/n with the exact (Clopper–Pearson) interval. Over several training
+seeds: mean ± standard deviation of the cells' rates, and a hierarchical bootstrap interval
+(training seeds, then episodes).
 """
 
 from collections import Counter
@@ -43,7 +43,7 @@ MEASURES = (
     ("false_ends", "false ends", "count", "subtasks ended before their success was measured"),
     ("end_delay_s", "end delay", "s", "median time from a subtask's measured success to its end"),
 )
-"""Columns of an episode's row that are no count: name, what, unit, explanation."""
+"""Columns of an episode's row that hold measurements: name, what, unit, explanation."""
 
 
 @dataclass(frozen=True)
@@ -58,22 +58,22 @@ class Across:
 
 @dataclass(frozen=True)
 class Group:
-    """One condition: its evaluations, one a training seed, and its cells that have none."""
+    """One condition: its evaluations, one per training seed, and its cells without one."""
 
     condition: Condition
     results: tuple[Result, ...] = ()
     missing: tuple[Missing, ...] = ()
     several: bool = False
-    """Whether another condition differs from it by nothing but the number of demonstrations."""
+    """Whether another condition differs from it only in the number of demonstrations."""
 
     @property
     def demonstrations(self) -> str:
-        """The number of demonstrations, where it tells the condition from another."""
+        """The number of demonstrations, if it distinguishes the condition from another."""
         return f"{self.condition.demonstrations} demonstrations" if self.several else ""
 
     @property
     def label(self) -> str:
-        """The condition with everything that tells it from others of its task."""
+        """The condition with everything that distinguishes it from others of its task."""
         return self.condition.label + (f", {self.demonstrations}" if self.several else "")
 
     @cached_property
@@ -83,18 +83,18 @@ class Group:
 
     @property
     def successes(self) -> int:
-        """Episodes that succeeded, k."""
+        """Number of episodes that succeeded, k."""
         return sum(bool(row["success"]) for row in self.rows)
 
     @property
     def paper_successes(self) -> int | None:
-        """Episodes that reached the paper's own success; None where 0.1 evaluated them."""
+        """Episodes successful by the paper's own criterion; None if version 0.1 evaluated them."""
         found = [row.get("paper_success") for row in self.rows]
         return None if None in found else sum(bool(value) for value in found)
 
     @property
     def episodes(self) -> int:
-        """Episodes, n; 0 where nothing was evaluated."""
+        """Number of episodes, n; 0 if nothing was evaluated."""
         return len(self.rows)
 
     @property
@@ -127,7 +127,7 @@ class Group:
         return {kind: found.count(kind) for kind in known if kind in found}
 
     def values(self, column: str) -> list[float | None]:
-        """Return a column over all episodes; without a value where there was nothing to measure."""
+        """Return a column over all episodes; None where there was nothing to measure."""
         return [measured(row, column) for row in self.rows]
 
     def on_successes(self, column: str) -> dict[str, float | None]:
@@ -149,7 +149,7 @@ class Group:
 def measured(row: Mapping[str, Any], column: str) -> float | None:
     """Return a value of an episode.
 
-    A needle that was never held has not slipped by 0 mm: it has no slip.
+    A needle that was never held has no slip, rather than one of 0 mm.
     """
     absent = column.startswith("slip") and row["failure"] == "missed"
     return None if absent else row.get(column)
@@ -174,7 +174,7 @@ def group(collected: Collected) -> list[Group]:
 def of_task(groups: Sequence[Group], task: str, *, plain: bool = True) -> list[Group]:
     """Return the groups of a task.
 
-    With `plain` only those without a shift and without a swapped expert.
+    With `plain`, only those without a shift, an expert swap or an upset.
     """
     return [
         item
@@ -184,7 +184,7 @@ def of_task(groups: Sequence[Group], task: str, *, plain: bool = True) -> list[G
 
 
 def best_trained(groups: Sequence[Group]) -> Group | None:
-    """The trained policy with the highest success rate (the first of them), or None."""
+    """Return the trained policy with the highest success rate (the first of them), or None."""
     trained = [item for item in as_trained(groups) if item.condition.trained]
     return max(trained, key=lambda item: item.rate, default=None)
 
@@ -192,8 +192,8 @@ def best_trained(groups: Sequence[Group]) -> Group | None:
 def as_trained(groups: Sequence[Group]) -> list[Group]:
     """Return the evaluations without a shift, on held-out starts.
 
-    Where there are none without a shift, those at strength 0, else all; where none of these is on
-    held-out starts, those on others.
+    If there are none without a shift, return those at strength 0, else all. If none of these is on
+    held-out starts, return those on others.
     """
     evaluated = [item for item in groups if item.episodes]
     plain = [item for item in evaluated if item.condition.plain]
@@ -202,6 +202,6 @@ def as_trained(groups: Sequence[Group]) -> list[Group]:
 
 
 def starts_of(groups: Sequence[Group]) -> str:
-    """Say what the starts are: "held-out starts", or "starts" where they are of several banks."""
+    """Say what the starts are: "held-out starts", or "starts" if they are from several banks."""
     banks = {item.condition.starts for item in groups}
     return f"{banks.pop()} starts" if len(banks) == 1 else "starts"

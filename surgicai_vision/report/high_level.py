@@ -1,4 +1,4 @@
-"""High-level policies: what each got right and wrong on the frames held out of its training."""
+"""High-level policies: what each got right and wrong on the frames held out from its training."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from surgicai_vision.training.checkpoint import StageErrors
 
 @dataclass(frozen=True)
 class ConfusionCell:
-    """Frames of one subtask that were named one subtask.
+    """Frames in which one subtask was due and one subtask was named.
 
     Attributes:
-        share: of the row's frames, as text [%]; "" where there is none.
-        frames: how many.
+        share: share of the row's frames, as text [%]; "" if there are none.
+        frames: how many frames.
         back: background colour.
         front: colour of the text.
     """
@@ -32,8 +32,8 @@ class HighLevel:
     """A high-level policy as the page shows it.
 
     Attributes:
-        label: the hierarchical policies that it decides in, and its training seeds.
-        rows: each subtask that was due, and what was named.
+        label: the hierarchical policies that it decides in, and their training seeds.
+        rows: each subtask that was due, and which ones were named.
         text: the numbers in words.
     """
 
@@ -43,7 +43,7 @@ class HighLevel:
 
 
 def high_level_policies(results: Iterable[Result]) -> list[HighLevel]:
-    """Return every high-level policy that decided in an evaluation and was counted, once each."""
+    """Return every high-level policy that decided in an evaluation and has known errors, once."""
     deciding: dict[str, list[Result]] = {}
     for result in results:
         if result.high_level:

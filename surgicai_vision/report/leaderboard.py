@@ -2,23 +2,23 @@
 
 Interface:
 
-* `make_row(folder, entry) -> Row`: what an evaluation's folder says, sealed by its digest.
+* `make_row(folder, entry) -> Row`: the row of an evaluation's folder, sealed by its digest.
 * `read_row(path) -> Row`: read a row's file; nothing in it is executed.
-* `problem(row) -> str`: why a row is not taken, or "".
+* `problem(row) -> str`: why a row is not accepted, or "".
 * `write_leaderboard(folder, out) -> Board`: check every `*.json` below a folder, write the page.
 
-A row is taken where all of this holds; successes are counted from its episodes, its own summary is
-never read:
+A row is accepted if all of the following hold; successes are counted from its episodes, and no
+summary is read:
 
 * its digest is that of its content;
 * its scene is the present one, by the hash of the compiled model;
 * its env is the task's default, or that of the shifted condition: everything `robustness` shifts,
-  at once and at half strength;
+  all at once and at half strength;
 * its starts are the first `FEWEST` or more seeds of the bank of test starts, each once and in
   order, so that any two rows of a task and a condition are paired.
 
-What no file can show is that a row was measured at all: the page says by whom, and the command that
-repeats it.
+No file can show that a row was measured at all, so the page says by whom, and gives the command
+that repeats it.
 """
 
 import json
@@ -41,25 +41,25 @@ from surgicai_vision.training.run_config import RunConfig
 
 FORMAT = 1
 FEWEST = 100
-"""Starts that a row has at least."""
+"""Minimum number of starts of a row."""
 HALF = 0.5
 CLEAN = "clean"
 SHIFTED = "shifted"
 LARGEST = 1 << 20
-"""Bytes that a row's file has at most: a whole row has some kilobytes."""
+"""Maximum size of a row's file in bytes; a complete row has a few kilobytes."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What whoever measured a row says of it.
+    """What the person who measured a row says about it.
 
     Attributes:
-        name: of the policy, as the page calls it.
+        name: the policy's name on the page.
         by: who measured it.
         link: where its code or paper is; "" for nowhere.
-        minutes: of training; None where it is not known.
+        minutes: minutes of training; None if not known.
         hardware: what it was trained on.
-        note: whatever a reader must know.
+        note: anything else that a reader must know.
     """
 
     name: str
@@ -87,16 +87,16 @@ class Row:
     """A row of the leaderboard.
 
     Attributes:
-        entry: what is said of it.
+        entry: what is said about it.
         run: what was evaluated.
         scene_hash: hash of the compiled scene.
         policy_sha256: hash of the policy's weights; "" for code that has none.
-        command: how it was evaluated.
-        versions: of the packages it was evaluated with.
+        command: the command that evaluated it.
+        versions: versions of the packages it was evaluated with.
         seeds: start of each episode.
-        successes: whether each was a success.
-        steps: control steps of each.
-        digest: of all of the above.
+        successes: whether each episode was a success.
+        steps: control steps of each episode.
+        digest: digest of all of the above.
         format: version of this layout.
     """
 
@@ -122,7 +122,7 @@ class Row:
         return SHIFTED if self.run.shift else CLEAN
 
     def sealed(self) -> "Row":
-        """Return it with the digest of its content."""
+        """Return the row with the digest of its content."""
         return replace(self, digest=digest(to_mapping(replace(self, digest=""))))
 
 
@@ -132,8 +132,8 @@ class Board:
 
     Attributes:
         page: where it was written.
-        taken: rows that stand on it.
-        refused: file → why its row does not.
+        taken: rows that are on it.
+        refused: file → why its row is not.
     """
 
     page: Path
@@ -145,8 +145,8 @@ def make_row(folder: Path, entry: Entry) -> Row:
     """Return the row of an evaluation's folder.
 
     Raises:
-        BadFile: there is no whole evaluation.
-        InputError: the row would not be taken.
+        BadFile: there is no complete evaluation.
+        InputError: the row would not be accepted.
     """
     evaluation = read_evaluation(folder)
     rows = read_rows(folder)
@@ -173,7 +173,7 @@ def read_row(path: Path) -> Row:
     """Read the file of a row.
 
     Raises:
-        BadFile: it is no row, or too large to be one.
+        BadFile: it is not a row, or too large to be one.
     """
     try:
         if not path.is_file():
@@ -183,7 +183,7 @@ def read_row(path: Path) -> Row:
         table = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(table, dict) or table.get("format") != FORMAT:
             raise BadFile(f"{path} is no row of format {FORMAT}.")
-        json.dumps(table, ensure_ascii=False).encode()  # a ValueError where no page can show it
+        json.dumps(table, ensure_ascii=False).encode()  # a ValueError if no page can show it
         return from_mapping(Row, table, str(path))
     except (OSError, ValueError, TypeError, RecursionError, InputError) as error:
         told = " ".join(str(error).split())[:200]
@@ -191,7 +191,7 @@ def read_row(path: Path) -> Row:
 
 
 def _default_config(run: RunConfig) -> TaskConfig:
-    """Return the env that a row must have; a hierarchical policy's is its own."""
+    """Return the env that a row must have; that of a hierarchical policy differs."""
     env = TaskConfig(run.task)
     if run.termination is None:
         return env
@@ -199,7 +199,7 @@ def _default_config(run: RunConfig) -> TaskConfig:
 
 
 def problem(row: Row) -> str:
-    """Return why a row is not taken, in a sentence; "" where it is."""
+    """Return why a row is not accepted, as a sentence; "" if it is."""
     if row.sealed().digest != row.digest:
         return "its digest is not that of its content; it was changed after it was made."
     env = row.run.env
@@ -265,7 +265,7 @@ def write_leaderboard(folder: Path, out: Path) -> Board:
 
 
 def _printable(text: str) -> str:
-    """Return a text with the bytes of a file's name that are no UTF-8 written as escapes."""
+    """Return a text in which bytes of a file's name that are not UTF-8 are escaped."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
@@ -327,7 +327,7 @@ def _table(rows: Sequence[Row]) -> list[dict[str, JSON]]:
 
 
 def _told(run: RunConfig) -> str:
-    """Return what a policy is told that no robot knows; "" where that is nothing."""
+    """Return what a policy is told that no robot knows; "" if that is nothing."""
     state = ["sees the state with the goal"] if run.sees_goal else []
     ends = ["ends told by the simulator"] if run.termination == "privileged" else []
     return "; ".join(state + ends)

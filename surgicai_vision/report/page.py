@@ -26,7 +26,7 @@ from surgicai_vision.report.reinforcement import learned
 from surgicai_vision.report.retention import looks, retentions
 
 FEW = 12
-"""Rows up to which a table of every cell is open from the start."""
+"""Most other policies that the text below the headline lists."""
 
 
 def render(page: dict[str, object]) -> str:
@@ -93,13 +93,13 @@ def numbers(
 
 
 def _told(collected: Collected) -> dict[str, str]:
-    """Return the main finding as the run itself tells it; empty where it does not."""
+    """Return the main finding as the run itself states it; empty if it does not."""
     run = collected.run
     return {key: run[key] for key in ("headline", "lead")} if run.get("headline") else {}
 
 
 def headline(groups: Sequence[Group]) -> dict[str, str]:
-    """Return the main finding in one sentence, and what it stands beside."""
+    """Return the main finding in one sentence, and what to compare it with."""
     evaluated = as_trained(groups)
     tasks = list(dict.fromkeys(item.condition.task for item in evaluated))
     if not evaluated:
@@ -137,7 +137,7 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
 def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str]:
     """Return the best of each task.
 
-    The best of many is a choice after the fact, and the page says so.
+    The best of many is chosen after the fact, and the page says so.
     """
     best = [found for task in tasks if (found := best_trained(of_task(evaluated, task)))]
     if not best:
@@ -183,12 +183,12 @@ def _counts(collected: Collected) -> list[tuple[int, str]]:
 
 
 def details(groups: Sequence[Group], reel: Reel, commands: dict[str, list[str]]) -> Markup:
-    """Return what a click shows, as JSON that may stand in a script element.
+    """Return what a click shows, as JSON that is safe in a script element.
 
     Args:
         groups: the conditions, in the order of the page.
         reel: the films.
-        commands: folder of a result → the commands that make its number again.
+        commands: folder of a result → the commands that reproduce its number.
     """
     shown_on_page = {choice.identity for choices in reel.compared.values() for choice in choices}
     made = [group_details(item, reel, commands, shown_on_page) for item in groups]

@@ -1,13 +1,18 @@
 """Pairs: exact McNemar on the same starts, Holm's correction within a task.
 
-Compared are trained conditions of a task that differ in one thing (`FACTORS`); recipes as wholes,
-with the encoder, views and demonstrations of each; multiplied demonstrations against the few they
-were made of; demonstrations and looks with the epochs that were trained on each; conditions of a
-plan, with how subtasks end in each; and each with images against proprioception alone. Policies of
-different kinds have recipes of their own, so on the same images and demonstrations they are
-compared as wholes, but never two that were given different minutes of training. Episodes are paired
-by training seed and start. The test speaks of the policies that were trained, not of all
-that the same recipe might give.
+Trained conditions of a task are compared if they differ in one thing (`FACTORS`). Some things count
+as one together with what belongs to them:
+
+* recipes, each with its encoder, views and demonstrations;
+* multiplied demonstrations, against the few they were made from;
+* demonstrations and looks, each with the epochs trained on them;
+* conditions of a plan, each with how its subtasks end;
+* policies with images, against proprioception alone;
+* policies of different kinds, each with its own recipe, on the same images and demonstrations, but
+  never two that were given different minutes of training.
+
+Episodes are paired by training seed and start. The test is about the policies that were trained,
+not about all that the same recipe might produce.
 """
 
 import itertools
@@ -40,7 +45,7 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "place": "place",
     }
 )
-"""Attribute of a condition → how a difference in it is called."""
+"""Attribute of a condition → the name of a difference in it."""
 AMOUNTS = ("demonstrations", "looks", "multiplied_from", "dagger_rounds")
 """Fields that say how much there was to learn from."""
 
@@ -53,8 +58,8 @@ class Pair:
         factor: what they differ in.
         episodes: paired episodes.
         first_only: episodes that only the first solved; likewise `second_only`.
-        p: exact two-sided McNemar.
-        adjusted: after Holm, over all pairs of the task.
+        p: p-value of the exact two-sided McNemar test.
+        adjusted: p-value after Holm's correction over all pairs of the task.
     """
 
     first: Group
@@ -90,7 +95,7 @@ def factor(first: Condition, second: Condition) -> str:
     blind = not first.views or not second.views
     fields = [
         name for name in FACTORS if not (blind and name == "pool")
-    ]  # no encoder, nothing taken from it
+    ]  # without an encoder, nothing is pooled
     differ = [name for name in fields if getattr(first, name) != getattr(second, name)]
     same_kind = "trained_by" not in differ
     if "recipe" in differ and same_kind and bool(first.views) == bool(second.views):
@@ -100,11 +105,11 @@ def factor(first: Condition, second: Condition) -> str:
         differ = [name for name in differ if name not in ("recipe", "changes")]
     if "multiplied_from" in differ and _originals(first) == _originals(second):
         differ = [name for name in differ if name != "demonstrations"]
-    if "dagger_rounds" in differ:  # a round brings demonstrations of its own
+    if "dagger_rounds" in differ:  # a round adds demonstrations
         differ = [name for name in differ if name != "demonstrations"]
     if set(differ) & set(AMOUNTS) and _without_amounts(first) == _without_amounts(second):
         differ = [name for name in differ if name != "changes"]
-    if "name" in differ:  # it says in which world
+    if "name" in differ:  # it says which world
         differ = [name for name in differ if name not in ("hierarchical", "world")]
     if blind:
         differ = ["images" if name == "encoder" else name for name in differ if name != "views"]
@@ -112,7 +117,7 @@ def factor(first: Condition, second: Condition) -> str:
 
 
 def _without_amounts(condition: Condition) -> list[str]:
-    """Return what is changed in the recipe but for how many frames of how many epochs it takes.
+    """Return what is changed in the recipe, except for the frames and epochs that it uses.
 
     More demonstrations need fewer of both.
     """
@@ -121,7 +126,7 @@ def _without_amounts(condition: Condition) -> list[str]:
 
 
 def _same_budget(first: Condition, second: Condition) -> bool:
-    """Return False where both have a budget of minutes, each another."""
+    """Return False if both have a budget of minutes and these differ."""
     return None in (first.minutes, second.minutes) or first.minutes == second.minutes
 
 
@@ -131,7 +136,7 @@ def _originals(condition: Condition) -> int | None:
 
 
 def _is_compared(condition: Condition) -> bool:
-    """Return True for what is trained and evaluated as trained, or in a condition of a plan."""
+    """Return True for a trained policy that is evaluated plainly, or in a condition of a plan."""
     return condition.trained and (condition.plain or bool(condition.name))
 
 

@@ -1,9 +1,9 @@
 """The paper's numbers: SurgicAI (NeurIPS 2024 Datasets and Benchmarks).
 
 Success rates as printed. Table 2 is image-based imitation, each encoder with the front and with the
-back view; it leaves insert out. The text speaks of 20 episodes × 5 seeds; the released code runs 3
-× 20 episodes of one trained policy, and every printed rate is a multiple of 1/60, so intervals are
-drawn for n = 60. The released evaluation adds noise to the actions, another amount for each
+back view; it leaves out insert. The text mentions 20 episodes × 5 seeds; the released code runs 3 ×
+20 episodes of one trained policy, and every printed rate is a multiple of 1/60, so intervals are
+drawn for n = 60. The released evaluation adds noise to the actions, a different amount for each
 encoder.
 """
 
@@ -11,7 +11,7 @@ from surgicai_vision.core import names
 
 SOURCE = "SurgicAI, NeurIPS 2024 Datasets and Benchmarks, Table 2"
 EPISODES = 60
-"""Episodes behind a printed rate: read from the released code and from the printed digits."""
+"""Episodes behind a printed rate: inferred from the released code and from the printed digits."""
 
 ENCODERS = ("r3m", "clip", "imagenet", "random")
 VIEWS = ("front", "back")
@@ -32,12 +32,12 @@ LEARNED = {
     "td3-her-bc": {"grasp": 0.96, "place": 0.97, "handoff": 0.98},
 }
 """Table 1: algorithm → subtask → success after 150,000 steps, with a welded needle and thresholds
-on the pose alone. The rows that the project's notes of the paper hold; others are not filled in.
+on the pose alone. Only the rows in the project's notes on the paper are filled in.
 """
 
 HIERARCHICAL = (0.88, 0.72, 0.60, 0.52)
-"""Table 3: the hierarchical policy, sequences from approach (grasp) on, from the shortest to
-the whole.
+"""Table 3: the hierarchical policy on sequences that begin with approach (grasp), from the shortest
+to the whole.
 """
 
 
@@ -49,5 +49,5 @@ def rate(task: str, encoder: str, view: str) -> float | None:
 
 
 def has(task: str, encoder: str) -> bool:
-    """Return True if Table 2 could hold the combination: one of its encoders, a subtask."""
+    """Return True if Table 2 could hold the combination: one of its encoders and a subtask."""
     return task in names.SUBTASKS and encoder in ENCODERS

@@ -1,4 +1,4 @@
-"""Beside the paper: which of our conditions stands beside which number of its Table 2."""
+"""Comparison with the paper: which of our conditions goes with which number of its Table 2."""
 
 from collections.abc import Sequence
 
@@ -10,17 +10,17 @@ from surgicai_vision.report.groups import Group
 
 _TELLING = tuple(name for name in paper.ENCODERS if name != "random")
 _DEMONSTRATIONS = 50
-"""Of each subtask, in the released code."""
+"""Demonstrations of each subtask in the released code."""
 
 
 def beside_paper(
     groups: Sequence[Group],
 ) -> list[tuple[str, str, list[tuple[float | None, Group | None]]]]:
-    """Return the paper's Table 2 and ours: (task, encoder, [(its rate, our condition) a view]).
+    """Return the paper's Table 2 and ours: (task, encoder, [(its rate, our condition) per view]).
 
-    The paper's encoders come first in each task, then ours that it has not. Rates are None where
-    the paper has none. Empty without a pretrained encoder of the paper's. Of several numbers of
-    demonstrations the one nearest to the paper's is taken.
+    The paper's encoders come first in each task, then those that only we have. Rates are None where
+    the paper has none. The list is empty if we have none of the paper's pretrained encoders. Of
+    several numbers of demonstrations, the one nearest to the paper's is used.
     """
     known = [item for item in groups if _comparable(item.condition)]
     if not any(item.condition.encoder in _TELLING for item in known):
@@ -69,9 +69,9 @@ def paper_rate(condition: Condition) -> float | None:
 
 
 def _comparable(condition: Condition) -> bool:
-    """Return True if it is what the paper's Table 2 holds.
+    """Return True if it is comparable to a number in the paper's Table 2.
 
-    One view of the two, everything else as usual.
+    It has one of the two views, and everything else is as usual.
     """
     usual = condition.trained and condition.plain and not condition.variant
     return usual and len(condition.views) == 1 and condition.views[0] in paper.VIEWS

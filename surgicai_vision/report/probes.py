@@ -1,4 +1,4 @@
-"""Probing: each encoder's linear probe beside the success of the policies that see through it."""
+"""Probing: each encoder's linear probe next to the success of the policies that use it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from surgicai_vision.report.curves import MOST, Chart
 from surgicai_vision.report.groups import Group
 
 FEWEST = 4
-"""Pairs below which no correlation is told."""
+"""Minimum number of pairs for reporting a correlation."""
 ALL = "all"
-"""Stands for the task of a probe that names none."""
+"""Task of a probe that names none."""
 
 
 @dataclass(frozen=True)
@@ -26,17 +26,17 @@ class ProbeRow:
     Attributes:
         task: the probe's task, or `ALL`.
         encoder: the encoder's name.
-        view: its views.
+        view: the views.
         tip_mm: error of the needle's tip [mm], as text.
         tip_rest: that error's interval and the mean pose's error, or "".
         tip_sort: what the column is sorted by.
         angle_deg: error of the needle's angle [deg], as text.
         angle_rest: that error's interval and the mean pose's error, or "".
         angle_sort: what the column is sorted by.
-        n: frames the probe was fitted on and asked for.
-        success: successes of the policies that see through the encoder, as "k/n".
+        n: episodes of the probe.
+        success: successes of the policies that use the encoder, as "k/n".
         rate: their rate, as text.
-        point: the rate at the tip's error, where there are both.
+        point: the rate at the tip's error, if there are both.
     """
 
     task: str
@@ -56,7 +56,7 @@ class ProbeRow:
 
 @dataclass(frozen=True)
 class Probes:
-    """Probe errors beside success: a table, a chart, and how the two go together."""
+    """Probe errors next to success: a table, a chart, and how the two correlate."""
 
     rows: tuple[ProbeRow, ...]
     chart: Chart | None
@@ -64,7 +64,7 @@ class Probes:
 
 
 def probes(found: Sequence[Mapping[str, Any]], groups: Sequence[Group]) -> Probes | None:
-    """Set each probe beside the success of the policies with its encoder, view, pool and task."""
+    """Pair each probe with the success of the policies with its encoder, view, pool and task."""
     if not found:
         return None
     rows = tuple(_row(probe, [item for item in groups if _matches(probe, item)]) for probe in found)
@@ -121,13 +121,13 @@ def _number(known: Sequence[float]) -> str:
 
 
 def _rest(probe: Mapping[str, Any], name: str) -> str:
-    """Return interval and the mean pose's error, where the probe tells them."""
+    """Return the interval and the mean pose's error, if the probe has them."""
     known = text.finite([probe.get(f"{name}_{part}") for part in ("low", "high", "chance")])
     return f"({known[0]:.2f}–{known[1]:.2f}; {known[2]:.2f})" if len(known) == 3 else ""
 
 
 def _chart(pairs: Sequence[tuple[ProbeRow, Point]]) -> Chart | None:
-    """Draw success against the probe's tip error, one sign an encoder."""
+    """Draw success against the probe's tip error, one marker per encoder."""
     if len(pairs) < 2 or len({point.x for _, point in pairs}) < 2:
         return None
     encoders = list(dict.fromkeys(row.encoder for row, _ in pairs))[:MOST]
@@ -144,7 +144,7 @@ def _chart(pairs: Sequence[tuple[ProbeRow, Point]]) -> Chart | None:
 
 
 def _correlations(pairs: Sequence[tuple[ProbeRow, Point]]) -> str:
-    """Describe Spearman's rank correlation of tip error and success, each task by itself."""
+    """Describe Spearman's rank correlation of tip error and success for each task."""
     parts = []
     for task in dict.fromkeys(row.task for row, _ in pairs):
         mine = [(point.x, point.rate) for row, point in pairs if row.task == task]

@@ -1,4 +1,4 @@
-"""Origin: with what, where and by which commands the numbers were made."""
+"""Provenance: with what, where and by which commands the numbers were produced."""
 
 import shlex
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ FLOW = ("demos", "dataset", "features", "policy", "evaluation", "report")
 
 
 def origin(collected: Collected, groups: Sequence[Group]) -> dict[str, object]:
-    """Return versions, seeds, machine, renderer and hashes; where cells differ, every value."""
+    """Return versions, seeds, machine, renderer and hashes; every value where cells differ."""
     run = collected.run
     results = collected.results
     made = [run["provenance"]] if run.get("provenance") else []
@@ -39,9 +39,9 @@ def origin(collected: Collected, groups: Sequence[Group]) -> dict[str, object]:
 
 
 def commands(result: Result, run: dict[str, Any]) -> list[str]:
-    """Return the commands that make a cell's number again.
+    """Return the commands that reproduce a cell's number.
 
-    From the stored policy, and from nothing.
+    One uses the stored policy; the other starts from scratch.
     """
     found = [evaluate_command(result), result.about.get("command") or run.get("command")]
     return list(dict.fromkeys(command for command in found if command))
@@ -72,7 +72,7 @@ def _cell(item: Group, result: Result) -> dict[str, str | int]:
 
 
 def _one_line(command: str) -> str:
-    """Return a command without the quotes of a shell; one that no shell reads as it stands."""
+    """Return a command without shell quotes, or unchanged if no shell can parse it."""
     try:
         return " ".join(shlex.split(command))
     except ValueError:

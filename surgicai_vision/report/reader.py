@@ -1,6 +1,6 @@
 """Reader: a results folder → evaluations, and the runs that have none with the reason why.
 
-A run's condition is all that it is but the training seed and the starts (`experiment_key`).
+A run's condition is everything about it except the training seed and the starts (`experiment_key`).
 """
 
 from collections import Counter
@@ -32,7 +32,7 @@ from surgicai_vision.training.run_config import REFERENCES, RunConfig
 __all__ = ["REFERENCES", "Collected", "Missing", "PlannedRun", "Result", "collect", "read_results"]
 
 WORK = "work"
-"""Folder of a sweep in which its jobs are at work."""
+"""Folder in which the jobs of a sweep work."""
 PROBES = ("probes.parquet", "probe.json")
 RUN_KINDS: Mapping[str, type] = MappingProxyType(
     {
@@ -63,8 +63,8 @@ class Result:
         summary: its counts.
         about: how it was made.
         rows: its episodes.
-        place: where it stands, if another evaluation of the same condition and training seed
-            stands elsewhere.
+        place: where it is stored, if another evaluation of the same condition and training seed
+            is stored elsewhere.
     """
 
     folder: Path
@@ -92,7 +92,7 @@ class Result:
 
     @property
     def high_level(self) -> dict[str, Any]:
-        """Hash and errors of the high-level policy that decided; empty where none was counted."""
+        """Hash and errors of the high-level policy that decided; empty if none are known."""
         found: dict[str, Any] = self.about.get("high_level") or {}
         return found
 
@@ -103,7 +103,7 @@ class Result:
 
     @cached_property
     def condition(self) -> Condition:
-        """What it is an evaluation of."""
+        """The condition that was evaluated."""
         return condition_of(self.run, self.place)
 
 
@@ -119,7 +119,7 @@ class Missing:
 
 
 class PlannedRun(Protocol):
-    """A run of a sweep and its state, as `experiments.sweep.plan` tells it."""
+    """A run of a sweep and its state, as `experiments.sweep.plan` reports it."""
 
     @property
     def run(self) -> RunConfig:
@@ -140,7 +140,7 @@ class PlannedRun(Protocol):
 
 @dataclass(frozen=True)
 class Collected:
-    """Everything a report is made of."""
+    """Everything a report is made from."""
 
     folder: Path
     results: list[Result]
@@ -150,7 +150,7 @@ class Collected:
 
     @property
     def notes(self) -> list[str]:
-        """What went wrong beside the runs."""
+        """What went wrong outside the runs."""
         return [str(line) for line in self.run.get("problems", [])]
 
 
@@ -163,8 +163,8 @@ def collect(folder: Path, planned: Sequence[PlannedRun] = ()) -> Collected:
             or not run.
 
     Raises:
-        BadFile: neither an evaluation nor a run that failed or was not run, or results of another
-            version.
+        BadFile: there is neither an evaluation nor a run that failed or was not run, or results
+            are from another version.
     """
     run = _read_run(folder / RUN_FILE) if (folder / RUN_FILE).exists() else {}
     results = read_results(folder, empty=True)
@@ -178,10 +178,10 @@ def collect(folder: Path, planned: Sequence[PlannedRun] = ()) -> Collected:
 
 
 def _read_run(path: Path) -> dict[str, Any]:
-    """Return what `run.json` holds, without what is null.
+    """Return what `run.json` holds, without null values.
 
     Raises:
-        BadFile: another version wrote it, or what the page shows is of another type.
+        BadFile: another version wrote it, or a value that the page shows has the wrong type.
     """
     run = {key: value for key, value in read_versioned(path).items() if value is not None}
     for key in RUN_KINDS.keys() & run.keys():
@@ -200,10 +200,10 @@ def read_results(folder: Path, empty: bool = False) -> list[Result]:
     """Read all evaluations below `folder`; trained policies first.
 
     Raises:
-        BadFile: there is none, unless `empty`, or another version wrote it.
+        BadFile: there is none (allowed with `empty`), or another version wrote one.
     """
     results = []
-    work = folder / WORK if (folder / GRID_FILE).exists() else None  # what is not filed yet
+    work = folder / WORK if (folder / GRID_FILE).exists() else None  # not filed yet
     for place in find_evaluations(folder):
         if work not in place.parents:
             stored = read_evaluation(place)
@@ -224,7 +224,7 @@ def read_results(folder: Path, empty: bool = False) -> list[Result]:
 def _once(results: Sequence[Result]) -> list[Result]:
     """Leave out a reference whose episodes are among those of another.
 
-    Several sweeps evaluate the same expert.
+    Several sweeps may evaluate the same expert.
     """
     kept: list[Result] = []
     references = [result for result in results if not result.trained]
@@ -244,9 +244,9 @@ def _outcomes(result: Result) -> set[tuple[int, bool, int]]:
 
 
 def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
-    """Name evaluations of the same condition and training seed by their folders.
+    """Distinguish evaluations of the same condition and training seed by their folders.
 
-    Counted together they would count twice.
+    Pooled, they would count twice.
     """
     count = Counter((result.condition, result.seed) for result in results)
     return [
@@ -275,13 +275,13 @@ def read_probes(folder: Path) -> list[dict[str, Any]]:
 
 
 def _checked_probe(row: object, path: Path) -> dict[str, Any]:
-    """Return a row of a file of probes if what the page shows of it is of its type."""
+    """Return a row of a probe file, if the values that the page shows have the right types."""
     probe = checked(row, dict, f"{path}: a row")
     for key in PROBE_TEXTS:
         checked(probe.get(key) or "", str, f"{path}: {key}")
     for key in PROBE_NUMBERS:
         value = probe.get(key)
-        if value is not None and value == value:  # an error that is unknown is null or NaN
+        if value is not None and value == value:  # an unknown error is null or NaN
             finite_number(value, f"{path}: {key}")
     views = probe.get("view") or ()
     for view in [views] if isinstance(views, str) else checked(views, list, f"{path}: view"):
@@ -321,12 +321,12 @@ def _missing(
 
 
 def _run_of(row: object, path: Path) -> RunConfig:
-    """Return the run that failed or was not run, as a file's row tells it."""
+    """Return the run that failed or was not run, as recorded in a file."""
     stored = checked(row, dict, f"{path}: a run")
     return from_mapping(RunConfig, checked(stored.get("run"), dict, f"{path}: run"), str(path))
 
 
 def _last_line(text: str) -> str:
-    """Return the last line of an error: of a traceback the one that names it."""
+    """Return the last line of an error, which in a traceback names it."""
     lines = [line.strip() for line in text.strip().splitlines() if line.strip()]
     return lines[-1] if lines else "no error was kept"

@@ -1,11 +1,11 @@
-"""Reinforcement and offline learning: the tables 1 and 4 beside the paper's, and learning curves.
+"""Reinforcement and offline learning: tables 1 and 4 next to the paper's, and learning curves.
 
-`learned(groups)` is None where no evaluation is of an actor (`train --algo`). Its rows are one an
-algorithm with the same settings and number of demonstrations; its cells are pooled counts of all
-training seeds with their exact interval, beside the paper's number where its table has one that is
-known here. The interquartile mean and the probability of improvement (`aggregates`) are taken over
-runs, a task and training seed each. Learning curves are those of `curve.json` beside a policy:
-validation starts, not the held-out ones of the tables.
+`learned(groups)` is None if no evaluation is of an actor (`train --algo`). It has one row per
+algorithm, settings and number of demonstrations. Its cells are pooled counts of all training seeds
+with their exact interval, next to the paper's number if its table has one that is known here. The
+interquartile mean and the probability of improvement (`aggregates`) are taken over runs, one per
+task and training seed. Learning curves are those of the `curve.json` next to a policy: on
+validation starts, not on the held-out ones of the tables.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,9 +27,9 @@ from surgicai_vision.rl.algorithms import ALGORITHMS
 
 CURVE = "curve.json"
 POLICY = "policy"
-"""Where a sweep keeps a run's policy, beside its evaluation."""
+"""Where a sweep keeps a run's policy, next to its evaluation."""
 MARK = 0.95
-"""The success whose first control steps a table names."""
+"""Success rate; a table says when each seed first reaches it."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Row:
     Attributes:
         algo: its name.
         settings: what is changed, what it sees and its demonstrations, in words.
-        shared: those of them that all rows of the table have.
+        shared: those of them that all rows of the table share.
         groups: task → its evaluations.
     """
 
@@ -50,7 +50,7 @@ class Row:
 
     @property
     def label(self) -> str:
-        """The algorithm with what tells it from the other rows."""
+        """The algorithm with what distinguishes it from the other rows."""
         return ", ".join((self.algo, *(word for word in self.settings if word not in self.shared)))
 
     def scores(self, tasks: Sequence[str]) -> list[list[float]]:
@@ -65,7 +65,7 @@ class Row:
 
     @cached_property
     def aggregate(self) -> tuple[float, tuple[float, float], int, int]:
-        """Interquartile mean over its runs, the interval, and of how many runs and tasks."""
+        """Interquartile mean over its runs, the interval, and the numbers of runs and tasks."""
         scores = self.scores(list(self.groups))
         generator = np.random.default_rng(0)
         bounds = aggregates.bootstrap(aggregates.interquartile_mean, [scores], generator)
@@ -75,16 +75,16 @@ class Row:
 
 @dataclass(frozen=True)
 class Learned:
-    """What a page says of learning.
+    """What a page says about learning.
 
     Attributes:
         tasks: columns of the table.
-        head: its head.
+        head: headings of the columns.
         rows: its rows, as text.
         shared: settings and demonstrations of every row, in words.
         better: rows of the probability that the best method beats another, as text.
         best: that method.
-        curves: success on the way against control steps, and against minutes, task by task.
+        curves: success during training against control steps, and against minutes, per task.
     """
 
     tasks: tuple[str, ...]
@@ -115,11 +115,11 @@ def learned(groups: Sequence[Group]) -> Learned | None:
 
 
 def table(groups: Sequence[Group]) -> list[Row]:
-    """Return the algorithms in the order of SurgicAI's tables, those with results alone."""
+    """Return the algorithms that have results, in the order of SurgicAI's tables."""
     found: dict[tuple[str, tuple[str, ...]], dict[str, Group]] = {}
     for item in groups:
         condition = item.condition
-        # Cloning from images is called "bc", too; an actor's run names its algorithm.
+        # Cloning from images is also called "bc"; an actor's run names its algorithm.
         is_actor = any(result.run.algo for result in item.results) and condition.plain
         is_actor = is_actor and condition.trained_by in ALGORITHMS
         if item.episodes and is_actor and condition.task in names.SUBTASKS and not condition.place:
@@ -160,7 +160,7 @@ def _cells(row: Row, tasks: Sequence[str]) -> tuple[str, ...]:
 
 
 def _better(best: Row, other: Row) -> tuple[str, ...]:
-    """Return how probably the best method beats another on the tasks that both have."""
+    """Return the probability that the best method beats another on the tasks that both have."""
     tasks = [task for task in best.groups if task in other.groups]
     if not tasks:
         return other.label, text.ABSENT, "no task in common"
@@ -176,7 +176,7 @@ def _better(best: Row, other: Row) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """One evaluation on the way: `rl.train.Point` as far as it is drawn."""
+    """One evaluation during training: the part of `rl.train.Point` that is drawn."""
 
     env_steps: int
     updates: int
@@ -186,11 +186,11 @@ class CurvePoint:
 
 
 Axis = Callable[[CurvePoint], float]
-"""Where an evaluation stands on a chart's x axis."""
+"""Where an evaluation is on a chart's x axis."""
 
 
 def read_curve(result: Result) -> list[CurvePoint]:
-    """Return the evaluations on the way to a result's policy; empty where none was kept."""
+    """Return the evaluations during the training of a result's policy; empty if none were kept."""
     places = [result.folder.parent / POLICY]
     places += [Path(str(result.about["folder"]))] if result.about.get("folder") else []
     for place in places:
@@ -207,7 +207,7 @@ def read_curve(result: Result) -> list[CurvePoint]:
 
 
 def first_at(mark: float, curve: Sequence[CurvePoint]) -> CurvePoint | None:
-    """Return the first evaluation with a success of `mark`, or None."""
+    """Return the first evaluation with a success rate of at least `mark`, or None."""
     for point in curve:
         if point.successes >= mark * point.episodes:
             return point
@@ -229,7 +229,7 @@ def _curves(rows: Sequence[Row], tasks: Sequence[str]) -> list[Chart]:
             for row in rows
         }
         for x_name, x in axes:
-            # A line without points keeps its colour: an algorithm has one on the whole page.
+            # A line without points keeps its colour: an algorithm has the same on the whole page.
             lines = [Series(label, _points(curves, x)) for label, curves in by_label.items()]
             if any(line.points for line in lines):
                 found.append(_chart(f"{task}: {x_name}", lines, x_name, x, by_label))
@@ -237,11 +237,11 @@ def _curves(rows: Sequence[Row], tasks: Sequence[str]) -> list[Chart]:
 
 
 def _points(curves: Sequence[Sequence[CurvePoint]], x: Axis) -> tuple[Point, ...]:
-    """Return the evaluations of all seeds, the n-th of each counted together.
+    """Return the evaluations of all seeds, the n-th of each pooled.
 
-    A seed that has ended counts with its last one, and stands where the others do. What does not
-    move along the axis is no curve and has no points: a single evaluation, or offline learning
-    against control steps.
+    A seed that has ended counts with its last one, at the x of the others. What does not move along
+    the axis is not a curve and has no points: a single evaluation, or offline learning against
+    control steps.
     """
     found = []
     for index in range(max(map(len, curves), default=0)):
@@ -262,7 +262,7 @@ def _chart(
     x: Axis,
     by_label: Mapping[str, Sequence[Sequence[CurvePoint]]],
 ) -> Chart:
-    """Draw learning curves; beside them where each seed first reaches `MARK`."""
+    """Draw learning curves; the table has where each seed first reaches `MARK`."""
     drawn = lines[:MOST]
     more = len([line for line in lines[MOST:] if line.points])
     rows = []

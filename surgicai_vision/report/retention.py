@@ -1,9 +1,10 @@
-"""Retention: what a policy keeps of its success under each shift, and in looks never seen.
+"""Retention: how much of its success a policy keeps under each shift, and in looks never seen.
 
-`retentions(groups)` is one chart a task and policy with several axes: bars of the area under the
-retention curve (the mean over the strengths of the success that is left, as a share of the plain
-one), the worst axis on top, with the retention at the largest strength and its interval beside it.
-`looks(groups)` sets a policy's evaluation in looks for training beside the one in held-out looks.
+`retentions(groups)` has one chart per task and policy with several axes. Its bars are the area
+under the retention curve: the remaining success as a share of the plain one, averaged over the
+strengths. The worst axis is on top. With each bar come the retention at the largest strength and
+its interval. `looks(groups)` puts a policy's evaluation in looks for training next to the one in
+held-out looks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,11 +30,11 @@ Start = tuple[int, int]
 
 @dataclass(frozen=True)
 class Kept:
-    """What is left along one axis.
+    """What remains along one axis.
 
     Attributes:
         axis: the axis.
-        area: area under the retention curve; None where nothing is left to divide by.
+        area: area under the retention curve; None if there is no plain success to divide by.
         strength: the largest strength.
         plain: successes and episodes without the shift.
         shifted: the same at the largest strength.
@@ -68,7 +69,7 @@ def retentions(groups: Sequence[Group]) -> list[Chart]:
 
 
 def _kept(axis: str, items: Sequence[Group]) -> Kept | None:
-    """Return what is left along an axis; None without the plain evaluation or a shifted one."""
+    """Return what remains along an axis; None without the plain evaluation or a shifted one."""
     ordered = sorted(items, key=lambda item: item.condition.strength)
     first, last = ordered[0], ordered[-1]
     if first.condition.strength > 0 or last is first:
@@ -168,8 +169,8 @@ def _row(row: Kept) -> tuple[str, ...]:
 def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
     """Return task, policy, counts in held-in and in held-out looks, and what is kept, as text.
 
-    A policy is in a row if it was evaluated in both; it is the same by all but where it stands,
-    what the condition is called and what it looked at, in worlds that vary alike in all else.
+    A policy has a row if it was evaluated in both. The two evaluations may differ in where they are
+    stored, the name of the condition and the looks; their worlds vary alike in all else.
     """
     seen: dict[tuple[Condition, str, RandomisationConfig], dict[bool, list[Result]]] = {}
     for item in groups:

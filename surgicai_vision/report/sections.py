@@ -19,7 +19,7 @@ PAIRS_SHOWN = 12
 
 
 def paper_rows(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, object]]:
-    """Return the paper's table beside ours, one row a task and encoder."""
+    """Return the paper's table next to ours, one row per task and encoder."""
     rows: list[dict[str, object]] = []
     for task, encoder, sides in beside_paper(groups):
         cells = []
@@ -83,10 +83,10 @@ def ceilings(groups: Sequence[Group]) -> str:
 
 
 def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, object]]:
-    """Return one heat map a view set: task × policy.
+    """Return one heat map per view set: task × policy.
 
-    Of several numbers of demonstrations the largest counts. What all policies of a map have in
-    common stands over it, what tells them apart over their columns.
+    Of several numbers of demonstrations the largest is shown. What all policies of a map have in
+    common is in its title; what distinguishes them is above their columns.
     """
     plain = [
         item for item in groups if item.condition.plain and item.condition.task != names.SUTURE
@@ -117,7 +117,7 @@ def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict
 
 
 def _apart(parts: Sequence[str], shared: Collection[str]) -> str:
-    """Name a policy by what it does not share with the others, or else by all of it."""
+    """Name a policy by what it does not share with the others, or else by everything."""
     return " · ".join(part for part in parts if part not in shared) or " · ".join(parts)
 
 
@@ -209,7 +209,7 @@ def success_row(at: int, item: Group, best: Group | None) -> dict[str, object]:
 
 
 def _note(item: Group) -> str:
-    """Say which training seeds are missing beside some that are there."""
+    """Say how many training seeds are missing, if others are there."""
     states = [cell.state for cell in item.missing]
     if not item.episodes or not states:
         return ""
@@ -288,7 +288,7 @@ def missing_rows(groups: Sequence[Group]) -> list[dict[str, object]]:
 
 
 def filters(groups: Sequence[Group]) -> list[tuple[str, list[str]]]:
-    """Return what the table can be filtered by: name, values; a single value is no choice."""
+    """Return what the table can be filtered by: name, values; a single value is left out."""
     values = {
         "task": [item.condition.task for item in groups],
         "encoder": [item.condition.encoder for item in groups],
@@ -332,7 +332,7 @@ def caption(groups: Sequence[Group]) -> str:
 
 
 def _starts(results: Sequence[Result]) -> str:
-    """Say from which starts the policies were counted, and whether from the same."""
+    """Say from which starts the policies were evaluated, and whether these were the same."""
     counted = {tuple(sorted(row["seed"] for row in result.rows)) for result in results}
     ranges = text.either(f"{seeds[0]}–{seeds[-1]}" for seeds in sorted(counted))
     if len(counted) == 1:

@@ -1,8 +1,8 @@
 """Tables: the page's numbers as Markdown, LaTeX (booktabs), CSV and Parquet.
 
-`algorithms.md`, where actors were evaluated, stands beside the paper's tables 1 and 4.
-`table.*` have one row a condition; `cells.parquet` one a cell (a training seed), those without a
-result too; `pairs.csv` one a comparison.
+`table.*` have one row per condition, `cells.parquet` one per cell (a training seed), including
+those without a result, and `pairs.csv` one per comparison. `algorithms.md`, written if actors were
+evaluated, has our numbers next to those of the paper's tables 1 and 4.
 """
 
 import csv
@@ -48,7 +48,7 @@ def write_tables(folder: Path, groups: Sequence[Group], pairs: Sequence[Pair], t
 
 
 def write_changed(path: Path, content: bytes) -> None:
-    """Write a file unless it holds that already: a second run changes nothing."""
+    """Write a file unless it already has that content: a second run changes nothing."""
     if not path.exists() or path.read_bytes() != content:
         files.write_bytes(path, content)
 
@@ -83,9 +83,10 @@ def condition_record(item: Group) -> dict[str, object]:
 
 
 def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, object]]:
-    """Yield one flat row a cell.
+    """Yield one flat row per cell.
 
-    What it is, its counts and measures, how to make it again, or why there is none.
+    It says what the cell is, its counts and measures and how to reproduce them, or why it has no
+    result.
     """
     for item in groups:
         for result in item.results:
@@ -124,7 +125,7 @@ def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, object]]:
 
 
 def evaluate_command(result: Result) -> str | None:
-    """Return the command that evaluates a cell's stored policy again, where one line does."""
+    """Return the command that evaluates a cell's stored policy again, if one line can."""
     about = result.about
     seeds = [row["seed"] for row in result.rows]
     whole = seeds == list(range(seeds[0], seeds[0] + len(seeds)))

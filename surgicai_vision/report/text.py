@@ -1,4 +1,4 @@
-"""Text: numbers as tables print them, intervals in brackets, absent is a dash.
+"""Text: numbers as tables print them, with intervals in brackets and a dash for absent ones.
 
 Rates are written by `core.percentages`.
 """
@@ -32,7 +32,7 @@ def finite(values: Sequence[float | None]) -> list[float]:
 def quartiles(values: Sequence[float | None]) -> tuple[float, float, float] | None:
     """Return lower quartile, median and upper quartile of the numbers among `values`.
 
-    None without any.
+    Return None if there are none.
     """
     known = finite(values)
     if not known:
@@ -44,7 +44,7 @@ def quartiles(values: Sequence[float | None]) -> tuple[float, float, float] | No
 def spread(values: Sequence[float | None]) -> str:
     """Return the median and quartiles as "0.8 (0.5–1.2)", with two significant digits.
 
-    Of how many is said where some are missing.
+    If some are missing, it also says how many there are.
     """
     found = quartiles(values)
     if found is None:
@@ -60,7 +60,7 @@ def spread(values: Sequence[float | None]) -> str:
 def probability(p: float, sign: str = "") -> str:
     """Return a p-value: "0.031", or "< 0.001" below that.
 
-    `sign` stands before a number that is given.
+    `sign` comes before a number that is given exactly.
     """
     return "< 0.001" if p < 0.001 else f"{sign}{p:.3f}"
 

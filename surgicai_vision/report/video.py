@@ -1,7 +1,7 @@
-"""The video that a page opens with, where its run has one.
+"""The video that a page opens with, if its run has one.
 
-A run says so in `run.json`: `"video": {"file", "poster", "strip", "title", "text"}`, files by their
-place in the results folder. Small files are embedded, so that the page stays one file.
+A run names it in `run.json`: `"video": {"file", "poster", "strip", "title", "text"}`, with paths
+inside the results folder. Small files are embedded, so that the page stays one file.
 """
 
 import base64
@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, Final
 
 EMBEDDED: Final = 5_000_000
-"""Bytes up to which a video is embedded; a larger one stays beside the page."""
+"""Bytes up to which a file is embedded; a larger one is linked by its path."""
 PARTS: Final = frozenset({"file", "poster", "strip", "title", "text"})
 """Keys of a run's video."""
 KINDS: Final = {".mp4": "video/mp4", ".jpg": "image/jpeg"}
 
 
 def opening_video(folder: Path, page: Path, run: Mapping[str, Any]) -> dict[str, str] | None:
-    """Return what the template shows of a run's video; None where there is none.
+    """Return what the template shows of a run's video; None if there is none.
 
     Args:
         folder: the results.
@@ -33,7 +33,7 @@ def opening_video(folder: Path, page: Path, run: Mapping[str, Any]) -> dict[str,
 
 
 def _address(path: Path, page: Path) -> str:
-    """Return a file as a data URI, or by its place beside the page where it is large."""
+    """Return a file as a data URI, or as its path relative to the page if it is large."""
     if not path.is_file():
         return ""
     if path.stat().st_size > EMBEDDED:

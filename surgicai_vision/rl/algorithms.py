@@ -1,6 +1,6 @@
-"""Algorithms by name: whose code they are, what they need and which settings they read.
+"""Algorithms by name: which library has them, what they need and which settings they read.
 
-Light to import, for the command line. What a library lacks is a small class beside this file:
+Light to import, for the command line. What the libraries lack is in small classes of this package:
 `nair.DemonstrationTD3` (behaviour cloning with a Q-filter), `buffers.HindsightBuffer` (relabelled
 success ends an episode), `rlpd.LayerNormPolicy`, `awac.PlainAWAC` (no entropy in its target).
 """
@@ -17,7 +17,7 @@ SB3_CONTRIB = "sb3_contrib"
 D3RLPY = "d3rlpy"
 
 SUCCESS = ("success_steps", "tolerance_share", "keeps_holes")
-"""What a success asks for in learning beyond the paper's (`core.config.SuccessRule`)."""
+"""What a success requires in learning beyond the paper's rule (`core.config.SuccessRule`)."""
 COMMON = ("hidden", "learning_rate", "gamma", "batch_size", "stop_at", *SUCCESS)
 ONLINE = (*COMMON, "envs")
 OFF_POLICY = (*ONLINE, "tau", "train_every", "updates", "learning_starts", "critics")
@@ -27,9 +27,9 @@ HINDSIGHT = ("goals", "relabel_demand")
 CLONING = ("demo_share", "bc_weight", "q_filter", "normalise_q", "clip_q")
 OFFLINE = (*COMMON, "tau", "critics", "samples")
 CLONED: Mapping[str, JSON] = {"tau": 0.01, "learning_rate": 3e-4}
-"""Defaults with a cloning loss: at 1e-3 what was learned is lost again (docs/results/rl.md)."""
+"""Defaults with a cloning loss: at 1e-3 the policy unlearns again (docs/results/rl.md)."""
 PAPERS_RATE = 3e-4
-"""Learning rate of AWAC, IQL and Cal-QL in their papers and in d3rlpy, whose Cal-QL has 1e-4 for
+"""Learning rate of AWAC, IQL and Cal-QL in their papers and in d3rlpy, whose Cal-QL uses 1e-4 for
 the actor."""
 
 
@@ -39,7 +39,7 @@ class Algorithm:
     """One algorithm.
 
     Attributes:
-        library: package whose code it is.
+        library: package that implements it.
         kind: its class there.
         paper: where it is described.
         settings: fields of `Settings` that it reads.

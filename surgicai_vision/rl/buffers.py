@@ -1,15 +1,15 @@
-"""Replay buffers of Stable-Baselines3 with demonstrations in every batch, and hindsight that ends.
+"""Replay buffers of Stable-Baselines3 that mix in demonstrations; hindsight ends episodes.
 
 * `MixedBuffer`: a `ReplayBuffer`. A part of every batch comes from demonstrations: half of it in
-  RLPD's symmetric sampling (Ball et al. 2023), R_D of Nair et al. 2018.
-* `HindsightBuffer`: a `HerReplayBuffer` that mixes likewise. Two things differ from the library's.
-  A relabelled success ends the episode, as a real one does: else the value of reaching a goal would
-  be that of staying there, which no episode shows. And a relabelled goal may keep what the task
-  asks for besides the pose (`keeps_demand`).
+  RLPD's symmetric sampling (Ball et al. 2023), R_D in Nair et al. 2018.
+* `HindsightBuffer`: a `HerReplayBuffer` that mixes in the same way. It differs from the library's
+  in two ways. A relabelled success ends the episode, as a real one does; otherwise the value of
+  reaching a goal would be that of staying there, which no episode shows. And a relabelled goal may
+  keep what the task requires besides the pose (`keeps_demand`).
 
     buffer.mix(demonstrations, share=0.5)
 
-The rows of demonstrations are the last of a batch.
+The demonstrations are the last rows of a batch.
 """
 
 from typing import Any, final
@@ -28,7 +28,7 @@ from surgicai_vision.rl.export import ACTIONS, fill, space_of
 from surgicai_vision.rl.transitions import Transitions
 
 DEMAND = 7
-"""The element of a goal that asks for what success needs besides the pose."""
+"""Index of a goal's element that says what success requires besides the pose."""
 Samples = ReplayBufferSamples | DictReplayBufferSamples
 Observations = torch.Tensor | dict[str, torch.Tensor]
 
@@ -47,11 +47,11 @@ class Demonstrations:
         self._share = share
 
     def rows(self, batch_size: int) -> int:
-        """Return how many rows of a batch are demonstrations; they are its last."""
+        """Return how many rows of a batch, the last ones, are demonstrations."""
         return round(self._share * batch_size)
 
     def mixed(self, own: Samples, batch_size: int) -> Samples:
-        """Return `own` with the demonstrations of a batch of `batch_size` after it."""
+        """Return `own` followed by the demonstrations of a batch of `batch_size`."""
         if self._source is None:
             return own
         return joined(own, self._source.sample(self.rows(batch_size)))
@@ -73,16 +73,16 @@ class HindsightBuffer(Demonstrations, HerReplayBuffer):
     """A replay buffer of goal dicts; see the module's docstring.
 
     Args:
-        buffer_size: transitions it holds, of all envs.
+        buffer_size: transitions it holds, over all envs.
         observation_space: that of obs_type "goal".
         action_space: (7,).
-        env: answers `compute_reward`, of the sparse reward.
-        keeps_demand: a relabelled goal asks for what the task asks for.
+        env: provides `compute_reward`, of the sparse reward.
+        keeps_demand: a relabelled goal keeps the requirement of the task.
         n_sampled_goal: relabelled transitions for each real one.
-        device: of the batches.
-        n_envs: envs whose transitions are added side by side.
-        optimize_memory_usage: as the library has it.
-        handle_timeout_termination: as the library has it.
+        device: device of the batches.
+        n_envs: envs whose transitions are added in parallel.
+        optimize_memory_usage: as in the library.
+        handle_timeout_termination: as in the library.
     """
 
     def __init__(
@@ -138,10 +138,10 @@ class HindsightBuffer(Demonstrations, HerReplayBuffer):
 
 
 def demonstrations_of(transitions: Transitions) -> ReplayBuffer:
-    """Return a buffer that holds demonstrations and no more, with the goals they reached.
+    """Return a buffer that holds only demonstrations, with the goals they reached.
 
-    They are not relabelled: they are the examples of success at the goals that the task asks for,
-    and with four of five relabelled a batch hardly had one.
+    They are not relabelled: they are the examples of success at the goals that the task sets. With
+    four of five relabelled, a batch would hardly contain one.
     """
     space = space_of(transitions)
     buffer: ReplayBuffer
@@ -154,7 +154,7 @@ def demonstrations_of(transitions: Transitions) -> ReplayBuffer:
 
 
 def joined(first: Any, second: Any) -> Samples:
-    """Return two batches of one kind as one."""
+    """Return two batches of the same kind, joined into one."""
     batch: Samples = first._replace(
         observations=_both(first.observations, second.observations),
         actions=torch.cat([first.actions, second.actions]),

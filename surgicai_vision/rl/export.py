@@ -10,17 +10,17 @@
 | minari | `minari/` | `minari.load_dataset(id)` with `MINARI_DATASETS_PATH` there |
 | robomimic | `demo.hdf5` | robomimic's `SequenceDataset`, and `train.py` with it |
 
-A Minari dataset knows its env: `recover_environment()` is the one that the transitions are of, and
+A Minari dataset records its env: `recover_environment()` returns the env of the transitions, and
 its episodes' seeds are those of their starts.
 
-robomimic's keys of observations are `flat` of an array, as its `EnvGym` has it, and the three parts
-of a goal dict; every tenth demonstration is in the mask `valid`, the others in `train`. It makes
-envs of the old package gym, whose steps have four results, so train with
+robomimic's observation keys are `flat` for an array, as in its `EnvGym`, and the three parts for a
+goal dict. Every tenth demonstration is in the mask `valid`, the others are in `train`. robomimic
+creates envs of the old package gym, whose steps return four values, so train with
 `experiment.rollout.enabled` false and evaluate elsewhere.
 
-`fill(buffer, transitions)` puts them into the replay buffer of a Stable-Baselines3 model of one's
-own, HER's included. d3rlpy keeps no observation after the last action of an episode, which it does
-not need: an episode ends with its success.
+`fill(buffer, transitions)` adds them to the replay buffer of your own Stable-Baselines3 model,
+HER's included. d3rlpy keeps no observation after the last action of an episode. It does not need
+one, because an episode ends with its success.
 """
 
 import copy
@@ -51,13 +51,13 @@ if TYPE_CHECKING:
 
 NPZ = "transitions.npz"
 CARD = "transitions.json"
-"""What the folder holds, in words."""
+"""File that describes what the folder holds."""
 ROBOMIMIC_GYM = 2
 """`EnvType.GYM_TYPE` of robomimic 0.3 (robomimic/envs/env_base.py)."""
 ROBOMIMIC_FLAT = "flat"
 """robomimic's key of an observation that is one array (robomimic/envs/env_gym.py)."""
 VALID_EVERY = 10
-"""One demonstration in so many is for validation, as robomimic's split_train_val.py has it."""
+"""One demonstration in this many is for validation, as in robomimic's split_train_val.py."""
 ACTIONS = spaces.Box(-1.0, 1.0, (7,), np.float32)
 
 
@@ -65,9 +65,9 @@ def write(transitions: Transitions, format: str, out: Path) -> Path:
     """Write transitions into a folder; return the file or folder that a library reads.
 
     Args:
-        transitions: of one env.
+        transitions: transitions of one env.
         format: one of `FORMATS`.
-        out: the folder, which is made.
+        out: the folder, which is created.
 
     Raises:
         InputError: the format's package is not installed, or takes no goal dicts.
@@ -203,7 +203,7 @@ FORMATS: Mapping[str, Callable[[Transitions, Path], Path]] = MappingProxyType(
         "robomimic": _write_robomimic,
     }
 )
-"""Format → what writes it."""
+"""Format → function that writes it."""
 PACKAGES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "npz": (),
@@ -213,11 +213,11 @@ PACKAGES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "robomimic": ("h5py",),
     }
 )
-"""Format → what must be installed."""
+"""Format → packages that must be installed."""
 
 
 def spec_of(transitions: Transitions) -> EnvSpec:
-    """Return the gymnasium spec of the env that transitions are of, with its arguments."""
+    """Return the gymnasium spec of the env of transitions, with its arguments."""
     spec = copy.deepcopy(gymnasium.spec(env_id(transitions.config.task)))
     options = to_mapping(transitions.config)
     del options["task"], options["max_steps"]
@@ -232,9 +232,9 @@ def space_of(transitions: Transitions) -> spaces.Space[object]:
 
 
 def buffer_of(transitions: Transitions) -> "ReplayBuffer":
-    """Return a replay buffer of Stable-Baselines3 that holds the transitions and no more.
+    """Return a replay buffer of Stable-Baselines3 that holds only the transitions.
 
-    Of obs_type "goal" it is a `HerReplayBuffer`; give it an env (`set_env`) before it relabels.
+    For obs_type "goal" it is a `HerReplayBuffer`; give it an env (`set_env`) before it relabels.
     """
     from stable_baselines3 import HerReplayBuffer
     from stable_baselines3.common.buffers import ReplayBuffer
@@ -255,8 +255,8 @@ def fill(buffer: "BaseBuffer", transitions: Transitions) -> None:
     """Add transitions to a replay buffer of Stable-Baselines3 for one env, in their order.
 
     Args:
-        buffer: a `ReplayBuffer`, or a `HerReplayBuffer` where they are goal dicts.
-        transitions: whose observations the buffer's space holds.
+        buffer: a `ReplayBuffer`, or a `HerReplayBuffer` for goal dicts.
+        transitions: transitions whose observations fit the buffer's space.
 
     Raises:
         InputError: a buffer of several envs.

@@ -1,19 +1,19 @@
-"""The extra `rl`: refused in one line where it is not installed."""
+"""The extra `rl`: a one-line refusal where it is not installed."""
 
 import importlib.util
 
 from surgicai_vision.core.errors import InputError
 
 PACKAGES = ("stable_baselines3", "sb3_contrib", "d3rlpy", "minari")
-"""What the extra brings."""
+"""What the extra installs."""
 
 
 def check_extra(asked: str, *packages: str) -> None:
-    """Raise `InputError` where a package of the extra is missing, without importing any.
+    """Raise `InputError` if a package of the extra is missing, without importing any.
 
     Args:
-        asked: what was asked for, for the message.
-        *packages: what it needs, of `PACKAGES`.
+        asked: what was requested, for the message.
+        *packages: what it needs, from `PACKAGES`.
     """
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:

@@ -1,15 +1,15 @@
-"""Features extractors of Stable-Baselines3: relative features of goal dicts, and standardising.
+"""Features extractors of Stable-Baselines3: relative features of goal dicts, and standardisation.
 
     SAC("MultiInputPolicy", env, policy_kwargs={
         "features_extractor_class": RelativeExtractor,
         "features_extractor_kwargs": {"task": "grasp"},
     }, replay_buffer_class=HerReplayBuffer)
 
-The features are computed from the dict that the replay buffer hands out, so after relabelling. They
-hold no weights: `mean` and `std` are buffers of the module and are saved with a model.
+The features are computed from the dict that the replay buffer returns, so after relabelling. The
+extractors have no weights: `mean` and `std` are buffers of the module and are saved with a model.
 
-The library gives actor, critics and their targets an extractor each, and all are shown the same
-tensors of a batch in turn; with one `FeatureMemo` for all of them the features are computed once.
+The library gives actor, critics and their targets one extractor each, and all get the same tensors
+of a batch in turn. With one `FeatureMemo` shared by all, the features are computed only once.
 """
 
 from collections import deque
@@ -33,9 +33,9 @@ PARTS = ("observation", "achieved_goal", "desired_goal")
 
 @final
 class FeatureMemo:
-    """The features of the last goal dicts, known by the identity of their tensors.
+    """The features of the last goal dicts, identified by their tensor objects.
 
-    Tensors of a batch are never written to. What is kept is no part of a saved model.
+    Tensors of a batch are never modified. The memo is not saved with a model.
     """
 
     KEPT = 2
@@ -61,12 +61,12 @@ class FeatureMemo:
 
 
 class StandardExtractor(BaseFeaturesExtractor):
-    """An observation that is one array, standardised.
+    """Standardise an observation that is one array.
 
     Args:
         observation_space: a Box (n,).
-        mean: what is removed from each element, (n,); None removes nothing.
-        std: what each is then divided by, (n,); None divides by 1.
+        mean: mean subtracted from each element, (n,); None subtracts nothing.
+        std: standard deviation each is then divided by, (n,); None divides by 1.
     """
 
     mean: torch.Tensor
@@ -93,14 +93,14 @@ class StandardExtractor(BaseFeaturesExtractor):
 
 @final
 class RelativeExtractor(StandardExtractor):
-    """The relative features of a goal dict, standardised; see the module's docstring.
+    """Compute and standardise a goal dict's relative features; see the module's docstring.
 
     Args:
         observation_space: that of obs_type "goal".
-        task: a subtask, whose arm acts.
+        task: a subtask; its arm acts.
         mean: as for `StandardExtractor`, (24,).
         std: the same.
-        memo: the same for all extractors of a model; None computes the features each time.
+        memo: shared by all extractors of a model; None computes the features each time.
     """
 
     def __init__(

@@ -1,20 +1,19 @@
 """PPO as high-level policy over fixed low-level ones: the hierarchy of SurgicAI's Table 3.
 
-`DecisionEnv` is the whole procedure with one decision a step: a subtask is chosen, its policy moves
-its arm until the subtask's measured success has held or its steps are over
-(`evaluation.hierarchical`, `termination: privileged`), and the next is chosen. What is observed is
+`DecisionEnv` is the whole procedure with one decision per step. A subtask is chosen, and its policy
+moves its arm until the subtask's measured success has held or its steps are used up
+(`evaluation.hierarchical`, `termination: privileged`). Then the next is chosen. The observation is
 what a robot measures: pose and jaw of both arms, (14,). The reward is 1 for a decision that solved
-the subtask that was due; any other gives 0 and ends the episode, since from where it leaves the
-arms hardly a decision is right, and what is due would be met once in so many. The paper does not
-say its own.
+the subtask that was due. Any other decision gives 0 and ends the episode: from where it leaves the
+arms, hardly any decision is right, and the subtask that is due would rarely be solved. The paper
+does not state its reward.
 
     train_high_level(HighLevelRequest(HierarchicalConfig(hlp="order", grasp="outputs/train/…", …,
                                       termination="privileged")), out)
 
-leaves a checkpoint of the policy `hlp`, for the key `hlp:` of a hierarchical policy's file. Every
-training state begins new episodes, in a training that was killed as in one that was not, so that
-the same command gives the same result; the folder, and which policy is kept, are those of
-`rl.train`.
+writes a checkpoint of the policy `hlp`, for the key `hlp:` of a hierarchical policy's file. New
+episodes begin after every training state, whether or not the training was killed, so that the same
+command gives the same result. The folder and the choice of the policy to keep are as in `rl.train`.
 """
 
 import dataclasses
@@ -61,7 +60,7 @@ ALGO = "ppo"
 SMALLEST_STD = 1e-3
 """Inputs that vary less [m, rad] are divided by this."""
 PLAYED_EPISODES = 2
-"""Episodes in the subtasks' order that give the statistics of the inputs."""
+"""Episodes played in the subtasks' order to get the statistics of the inputs."""
 
 Vector = NDArray[np.float32]
 
@@ -76,7 +75,7 @@ class Point:
         minutes: CPU time of learning so far, evaluations left out.
         successes: whole procedures that succeeded.
         episodes: whole procedures evaluated, from validation starts.
-        stages: subtasks solved in them, on average.
+        stages: mean number of subtasks solved in them.
     """
 
     decisions: int
@@ -89,10 +88,10 @@ class Point:
 
 @final
 class DecisionEnv(gymnasium.Env[Vector, np.int64]):
-    """The whole procedure, one decision a step; see the module's docstring.
+    """The whole procedure, with one decision per step; see the module's docstring.
 
     Args:
-        config: how many steps a subtask and decisions an episode may take.
+        config: limits on the steps of a subtask and the decisions of an episode.
         task: the whole procedure's config.
         low: the low-level policies' agents, in the order of the subtasks.
     """
@@ -152,7 +151,7 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
         return env.both_arms(), float(solved), terminated, truncated, about
 
     def _has_ended(self, subtask: int) -> bool:
-        """Return True if the present subtask's success has held, as a privileged end has it."""
+        """Return True if the present subtask's success has held, as in privileged termination."""
         env = self._env
         if subtask == env.phase == GRASP and env.dwell >= self.config.grasp_hold:
             env.enter(GRASP + 1)
@@ -160,7 +159,7 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
 
     @property
     def phase(self) -> int:
-        """The subtask that is on, an index in `names.SUBTASKS`."""
+        """The present subtask, an index in `names.SUBTASKS`."""
         return self._env.phase
 
     def close(self) -> None:
@@ -171,15 +170,15 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
 def train_high_level(
     request: HighLevelRequest, out: Path, *, progress: Progress | None = None
 ) -> Checkpoint:
-    """Train PPO over low-level policies, or go on where it was broken off.
+    """Train PPO over low-level policies, or resume an interrupted training.
 
     Args:
         request: what is trained.
         out: the checkpoint folder; new, or one of the same request.
-        progress: called with (decisions done, in all).
+        progress: called with (decisions done, decisions in total).
 
     Raises:
-        BadFile: a low-level policy that is no checkpoint.
+        BadFile: a low-level policy that is not a checkpoint.
         InputError: policies of other subtasks, or of different scenes.
         OutputExists: `out` holds something else.
     """
@@ -202,7 +201,7 @@ def train_high_level(
 def _run(
     request: HighLevelRequest, task: TaskConfig, env: DecisionEnv, out: Path, progress: Progress
 ) -> Checkpoint:
-    """Learn to the end, with an evaluation and a training state every so often."""
+    """Learn to the end, with periodic evaluations and training states."""
     mean, std = _statistics(env)
     env.control_steps = 0
     model = _model(request, env, mean, std)
@@ -245,7 +244,7 @@ def _model(
 
 
 def _statistics(env: DecisionEnv) -> tuple[list[float], list[float]]:
-    """Return mean and standard deviation of what procedures in the subtasks' order observe."""
+    """Return mean and standard deviation of the observations in procedures in subtask order."""
     rows = []
     for episode in range(PLAYED_EPISODES):
         seen, _ = env.reset(seed=names.TRAIN_SEED + episode)
@@ -263,7 +262,7 @@ def _statistics(env: DecisionEnv) -> tuple[list[float], list[float]]:
 
 
 def _save(model: PPO, env: DecisionEnv, out: Path, curve: Sequence[Point], best: Weights) -> None:
-    """Write the training state, whole."""
+    """Write the training state, atomically."""
     state = {
         "parameters": model.get_parameters(),
         "decisions": model.num_timesteps,
@@ -277,7 +276,7 @@ def _save(model: PPO, env: DecisionEnv, out: Path, curve: Sequence[Point], best:
 
 
 def _resume(model: PPO, env: DecisionEnv, out: Path) -> tuple[list[Point], Weights]:
-    """Go on from the training state, if there is a whole one; return the curve and the best."""
+    """Resume from the training state, if it is complete; return the curve and the best weights."""
     state = read_state(out)
     if state is None:
         return [], {}
@@ -293,7 +292,7 @@ def _resume(model: PPO, env: DecisionEnv, out: Path) -> tuple[list[Point], Weigh
 
 
 def _recipe(request: HighLevelRequest) -> Recipe:
-    """Return what a checkpoint says of its network and training."""
+    """Return the recipe that a checkpoint records of its network and training."""
     return policy_plugin(HLP).recipe(
         hidden=request.settings.hidden,
         batch_norm=False,
@@ -325,7 +324,7 @@ def _evaluate(
     env: DecisionEnv,
     minutes: float,
 ) -> Point:
-    """Count whole procedures from validation starts, by what is evaluated of the checkpoint too."""
+    """Evaluate whole procedures from validation starts, in the way a checkpoint is evaluated."""
     successes = 0
     stages = 0.0
     if request.validation:
@@ -349,12 +348,12 @@ def _evaluate(
 
 
 def run_of(request: HighLevelRequest, task: TaskConfig, env_steps: int | None = None) -> RunConfig:
-    """Return the run that a request is.
+    """Return the run that a request describes.
 
     Args:
         request: what is trained.
         task: any task of the procedure's scene.
-        env_steps: control steps that it took; None before it has.
+        env_steps: control steps taken; None before training.
     """
     return RunConfig(
         env=dataclasses.replace(task, task=names.SUTURE, max_steps=0, advance="success"),
@@ -375,7 +374,7 @@ def _write(
     env: DecisionEnv,
     out: Path,
 ) -> Checkpoint:
-    """Write the high-level policy of these weights, those of the point that is kept."""
+    """Write the high-level policy with these weights, which are those of the point kept."""
     checkpoint = Checkpoint(
         run=run_of(request, task, env.control_steps),
         recipe=to_mapping(_recipe(request)),

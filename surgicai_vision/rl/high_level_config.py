@@ -1,4 +1,4 @@
-"""What PPO learns as a high-level policy, as data; light to import. See `rl.high_level`."""
+"""How PPO is trained as a high-level policy, as data; light to import. See `rl.high_level`."""
 
 from dataclasses import dataclass, field
 from typing import final
@@ -9,20 +9,20 @@ from surgicai_vision.evaluation.hierarchical_config import ORDER, HierarchicalCo
 DECISIONS = 1500
 """Decisions to learn from, by default."""
 SAVE_EVERY = 500
-"""Decisions from one training state to the next, by default."""
+"""Decisions between training states, by default."""
 
 
 @final
 @dataclass(frozen=True)
 class HighLevelSettings:
-    """Settings of PPO over low-level policies; the paper names the algorithm and none of them.
+    """Settings of PPO over low-level policies; the paper names only the algorithm.
 
     Attributes:
         hidden: width of each hidden layer of actor and critic.
-        learning_rate: Adam's.
-        gamma: discount a decision.
-        rollout: decisions from update to update.
-        batch_size: decisions of a gradient step.
+        learning_rate: Adam's learning rate.
+        gamma: discount per decision.
+        rollout: decisions between updates.
+        batch_size: decisions per gradient step.
         epochs: passes over a rollout.
         entropy: weight of the entropy bonus.
     """
@@ -59,10 +59,10 @@ class HighLevelRequest:
     Attributes:
         low: the low-level policies, fixed; `hlp: order` and `termination: privileged`.
         decisions: decisions to learn from.
-        settings: of PPO.
-        seed: of networks, decisions and starts.
+        settings: PPO's settings.
+        seed: seed of networks, decisions and starts.
         validation: episodes of the evaluation at each state, from validation starts.
-        save_every: decisions from one training state to the next.
+        save_every: decisions between training states.
     """
 
     low: HierarchicalConfig

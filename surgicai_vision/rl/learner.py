@@ -1,6 +1,6 @@
-"""What every learner offers `train`: go on, say where it is, hand out its actor, be stored.
+"""The interface of a learner for `train`: advance, report progress, export the actor, save state.
 
-A state is a flat table of tensors, numbers and texts, so that it is read without running code
+A state is a table of tensors, numbers and texts, so that it can be read without running code
 (`torch.load(weights_only=True)`).
 """
 
@@ -20,12 +20,12 @@ State = dict[str, Any]
 
 
 class Learner(abc.ABC):
-    """One algorithm at work.
+    """One running algorithm.
 
     Attributes:
         squash: how its actor's mean becomes an action (`policies.actor.SQUASHES`).
-        mean: what is removed from each input, (n,).
-        std: what each input is then divided by, (n,).
+        mean: mean subtracted from each input, (n,).
+        std: standard deviation each input is then divided by, (n,).
     """
 
     squash = "tanh"
@@ -44,19 +44,19 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def advance(self, target: int) -> dict[str, float]:
-        """Go on until `done` is `target` or a little more; return the last losses by name."""
+        """Learn until `done` is `target` or slightly more; return the last losses by name."""
 
     @abc.abstractmethod
     def fill(self, policy: Policy) -> None:
-        """Give a policy of ours (`Algorithm.policy`) the weights of the library's actor."""
+        """Copy the weights of the library's actor into our policy (`Algorithm.policy`)."""
 
     @abc.abstractmethod
     def get_state(self) -> State:
-        """Return what the next step depends on."""
+        """Return everything that the next step depends on."""
 
     @abc.abstractmethod
     def set_state(self, state: State) -> None:
-        """Go on from what `get_state` returned."""
+        """Restore what `get_state` returned."""
 
     @abc.abstractmethod
     def close(self) -> None:
@@ -88,7 +88,7 @@ def set_random_state(state: State) -> None:
 
 @final
 class Arrays:
-    """Arrays by attribute, of an object that keeps them: how replay buffers are stored."""
+    """Read and write the array attributes of an object, such as a replay buffer."""
 
     @staticmethod
     def of(owner: object, names: tuple[str, ...], rows: int) -> State:

@@ -1,17 +1,17 @@
 """TD3 with demonstrations, behaviour cloning and a Q-filter, after Nair et al. 2018.
 
 "Overcoming exploration in reinforcement learning with demonstrations" (ICRA 2018,
-arXiv:1709.10089) has DDPG; SurgicAI and this class have TD3, whose critics are trained as they are.
-A part of each batch comes from the demonstrations (`buffers`), and the actor climbs
+arXiv:1709.10089) uses DDPG; SurgicAI and this class use TD3, whose critics are trained as usual.
+A part of each batch comes from the demonstrations (`buffers`), and the actor ascends
 
     λ1 ∇J - λ2 ∇L_BC,    L_BC = Σ_i ‖π(s_i | g_i) - a_i‖² · 1[Q(s_i, a_i) > Q(s_i, π(s_i))]
 
 over the demonstrations of the batch, λ1 + λ2 = 1 (SurgicAI). Here the sum is a mean over them, and
-with `normalise_q` J is divided by the mean size of Q (Fujimoto and Gu 2021), so that λ2 weighs the
-same whatever the scale of the reward. With `clip_q` the targets stay within [-1 / (1 - γ), 0], the
+with `normalise_q` J is divided by the mean absolute Q (Fujimoto and Gu 2021), so that λ2 has the
+same effect at any scale of the reward. With `clip_q` the targets stay within [-1 / (1 - γ), 0], the
 returns that the reward allows (Andrychowicz et al. 2017 clip theirs).
 
-`AnchoredTD3` is what it shares with other actors that are held to what was there before them.
+`AnchoredTD3` is the part shared with other actors that are kept close to an existing behaviour.
 """
 
 from abc import abstractmethod
@@ -36,10 +36,10 @@ def cloning_loss(
     """Return L_BC, a mean over demonstrations, and the share of them that passes the filter.
 
     Args:
-        actions: the actor's in demonstrated states, (n, 7).
-        demonstrated: the demonstrations', (n, 7).
-        values: Q of the actor's, (n, 1).
-        demonstrated_values: Q of the demonstrated, (n, 1).
+        actions: the actor's actions in demonstrated states, (n, 7).
+        demonstrated: the demonstrated actions, (n, 7).
+        values: Q of the actor's actions, (n, 1).
+        demonstrated_values: Q of the demonstrated actions, (n, 1).
         q_filter: clone only where the critic values the demonstrated action above the actor's.
     """
     passes = (demonstrated_values > values).float().detach()
@@ -50,14 +50,14 @@ def cloning_loss(
 
 
 class AnchoredTD3(TD3):
-    """TD3 whose actor climbs λ1 ∇J - λ2 ∇L, with a loss L that holds it to something known.
+    """TD3 whose actor ascends λ1 ∇J - λ2 ∇L, with a loss L that keeps it close to a reference.
 
     Args:
         *arguments: TD3's.
         bc_weight: λ2; λ1 = 1 - λ2.
-        normalise_q: divide J by the mean size of Q.
+        normalise_q: divide J by the mean absolute Q.
         clip_q: clip the targets to the returns that a reward in [-1, 0] allows.
-        actor_starts: updates of the critics before the actor's first.
+        actor_starts: critic updates before the actor's first update.
         **options: TD3's.
     """
 
@@ -78,10 +78,10 @@ class AnchoredTD3(TD3):
 
     @abstractmethod
     def losses(self, batch: Any) -> dict[str, torch.Tensor]:
-        """Return "actor_loss", of a batch of the replay buffer, and the parts that are logged."""
+        """Return "actor_loss" for a batch of the replay buffer, and the parts that are logged."""
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Take updates as TD3 does, with the actor's loss above."""
+        """Take updates as TD3 does, but with the actor's loss from `losses`."""
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         logged: dict[str, list[float]] = {"critic_loss": []}
@@ -124,7 +124,7 @@ class AnchoredTD3(TD3):
 
     @torch.no_grad()
     def _targets(self, batch: Any) -> torch.Tensor:
-        """Return the critics' targets (B, 1): TD3's, clipped to what returns can be."""
+        """Return the critics' targets (B, 1): TD3's, clipped to the possible returns."""
         noise = torch.empty_like(batch.actions).normal_(0, self.target_policy_noise)
         noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
         actions = (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
@@ -158,12 +158,12 @@ class DemonstrationTD3(AnchoredTD3):
     def actor_losses(
         self, observations: Any, actions: torch.Tensor, demonstrated: int
     ) -> dict[str, torch.Tensor]:
-        """Return the actor's loss, its part of cloning, and the share that passes the filter.
+        """Return the actor's loss, its cloning part, and the share that passes the filter.
 
         Args:
-            observations: of a batch.
+            observations: the observations of a batch.
             actions: its actions, (B, 7).
-            demonstrated: how many rows, the last, are demonstrations.
+            demonstrated: how many of its rows, the last ones, are demonstrations.
         """
         chosen = self.actor(observations)
         values = self.critic.q1_forward(observations, chosen)

@@ -1,4 +1,4 @@
-"""Offline learning by d3rlpy: from demonstrations alone, without a step in an env."""
+"""Offline learning with d3rlpy: from demonstrations alone, without a step in an env."""
 
 import io
 import logging
@@ -30,7 +30,7 @@ from surgicai_vision.rl.transitions import Transitions
 
 
 def _actor_critic(settings: Settings) -> dict[str, Any]:
-    """Return what all configurations with actor and critics share."""
+    """Return the options that all configurations with actor and critics share."""
     encoder = VectorEncoderFactory(list(settings.hidden))
     return {
         "actor_learning_rate": settings.learning_rate,
@@ -95,8 +95,8 @@ class OfflineLearner(Learner):
     Args:
         request: what is trained.
         transitions: the demonstrations.
-        mean: what is removed from each input, (n,).
-        std: what each input is then divided by, (n,).
+        mean: mean subtracted from each input, (n,).
+        std: standard deviation each input is then divided by, (n,).
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class OfflineLearner(Learner):
         self.request = request
         self.mean = torch.from_numpy(mean).float()
         self.std = torch.from_numpy(std).float()
-        # The library tells of every step on stdout, where --json prints.
+        # The library logs every step to stdout, where --json prints.
         structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
         d3rlpy.seed(request.seed)
         rows = ((transitions.vector - mean) / std).astype(np.float32)
@@ -133,7 +133,7 @@ class OfflineLearner(Learner):
         return int(self._algo.grad_step)
 
     def advance(self, target: int) -> dict[str, float]:
-        """Take updates until there are so many; return the mean losses."""
+        """Take updates until there are `target`; return the mean losses."""
         losses: dict[str, list[float]] = {}
         while self.updates < target:
             batch = self._dataset.sample_transition_batch(self.request.settings.batch_size)
@@ -142,7 +142,7 @@ class OfflineLearner(Learner):
         return {name: float(np.mean(values)) for name, values in losses.items()}
 
     def fill(self, policy: Policy) -> None:
-        """Give a policy of ours the weights of the library's actor."""
+        """Copy the weights of the library's actor into our policy."""
         impl = self._algo.impl
         if isinstance(policy, BatchConstrained):
             parts = (impl.modules.vae_decoder, impl.modules.policy, impl.modules.q_funcs[0])
@@ -168,7 +168,7 @@ class OfflineLearner(Learner):
         }
 
     def set_state(self, state: State) -> None:
-        """Go on from what `get_state` returned."""
+        """Restore what `get_state` returned."""
         content = io.BytesIO()
         torch.save(state["model"], content)
         content.seek(0)
@@ -181,6 +181,6 @@ class OfflineLearner(Learner):
 
 
 def _layers(module: Any) -> list[nn.Linear]:
-    """Return the linear layers of a network of the library's, from its input to its answer."""
+    """Return the linear layers of one of the library's networks, from input to output."""
     head = module._mu if hasattr(module, "_mu") else module._fc
     return [*linear(module._encoder), head]

@@ -1,4 +1,4 @@
-"""Online learning by Stable-Baselines3: models from a request, and their whole state."""
+"""Online learning with Stable-Baselines3: models from a request, and their complete state."""
 
 import io
 import json
@@ -54,9 +54,9 @@ class OnlineLearner(Learner):
 
     Args:
         request: what is trained.
-        transitions: the demonstrations of an algorithm that learns from some, else None.
-        mean: what is removed from each input, (n,).
-        std: what each input is then divided by, (n,).
+        transitions: the demonstrations; None for an algorithm that uses none.
+        mean: mean subtracted from each input, (n,).
+        std: standard deviation each input is then divided by, (n,).
         workers: worker processes of the envs.
     """
 
@@ -77,7 +77,7 @@ class OnlineLearner(Learner):
         self.env = SuturingVecEnv.of(request.env, obs_type, settings.envs, workers)
         self.env.set_attr("success_rule", settings.success_rule)
         self.model = self._model()
-        self.log_to(Logger(None, []))  # without one `learn` makes a folder for it at every call
+        self.log_to(Logger(None, []))  # without it `learn` creates a log folder at every call
         if transitions is not None:
             buffer = self._buffer
             assert isinstance(buffer, MixedBuffer | HindsightBuffer)
@@ -117,7 +117,7 @@ class OnlineLearner(Learner):
         return kind(policy, self.env, policy_kwargs=network, **options)
 
     def _network(self) -> dict[str, Any]:
-        """Return how the networks see an observation."""
+        """Return the options for how the networks see an observation."""
         inputs: dict[str, Any] = {"mean": self.mean.tolist(), "std": self.std.tolist()}
         has_goal = self.request.algorithm.has_hindsight
         if has_goal:
@@ -129,7 +129,7 @@ class OnlineLearner(Learner):
         }
 
     def _replay(self) -> dict[str, Any]:
-        """Return what is replayed, and how often it is learned from."""
+        """Return the options of the replay buffer and of the updates."""
         request = self.request
         settings = request.settings
         options: dict[str, Any] = {
@@ -149,7 +149,7 @@ class OnlineLearner(Learner):
         return options
 
     def _exploration(self) -> dict[str, Any]:
-        """Return the noise of actions, and that of the targets of twin critics."""
+        """Return the options of the noise on actions and on the targets of twin critics."""
         settings = self.request.settings
         read = self.request.algorithm.settings
         options: dict[str, Any] = {}
@@ -163,7 +163,7 @@ class OnlineLearner(Learner):
         return options
 
     def _learning_starts(self) -> int:
-        """Return the steps of random actions: hindsight needs an episode that has ended."""
+        """Return the number of random steps at first: hindsight needs a finished episode."""
         settings = self.request.settings
         if settings.learning_starts:
             return settings.learning_starts
@@ -196,7 +196,7 @@ class OnlineLearner(Learner):
         self.model.set_logger(logger)
 
     def advance(self, target: int) -> dict[str, float]:
-        """Go on until so many control steps are done."""
+        """Learn until `target` control steps are done."""
         decisions = -(-target // self.request.env.action_repeat)
         self.model.learn(
             decisions - self.model.num_timesteps, reset_num_timesteps=False, log_interval=4
@@ -205,7 +205,7 @@ class OnlineLearner(Learner):
         return {"training success": float(np.mean(successes))} if successes else {}
 
     def fill(self, policy: Policy) -> None:
-        """Give an actor of ours the weights of the model's."""
+        """Copy the weights of the model's actor into ours."""
         model: Any = self.model.policy
         if isinstance(self.model, PPO):
             parts = [model.mlp_extractor.policy_net, model.action_net]
@@ -216,7 +216,7 @@ class OnlineLearner(Learner):
         assert isinstance(policy, Actor)
         policy.take([layer for part in parts for layer in linear(part)], self.mean, self.std)
 
-    # -- the whole state ---------------------------------------------------------------------------
+    # -- the complete state ------------------------------------------------------------------------
 
     def get_state(self) -> State:
         """Return networks, optimisers, replay buffer, envs, counters and random state."""
@@ -249,7 +249,7 @@ class OnlineLearner(Learner):
         return state
 
     def set_state(self, state: State) -> None:
-        """Go on from what `get_state` returned."""
+        """Restore what `get_state` returned."""
         model = self.model
         if model._last_obs is None:
             model._setup_learn(0, None, reset_num_timesteps=False)
@@ -296,7 +296,7 @@ def _tensors(value: Any) -> Any:
 
 
 def _arrays(value: Any) -> Any:
-    """Return what `_tensors` made as arrays again."""
+    """Return the result of `_tensors` as arrays again."""
     if isinstance(value, Mapping):
         return {key: _arrays(part) for key, part in value.items()}
     return value.numpy().copy()

@@ -1,17 +1,17 @@
-"""A correction of a frozen image policy, learned by reinforcement with sparse reward.
+"""A correction of a frozen image policy, from reinforcement learning with a sparse reward.
 
-`CorrectionEnv` is the policy's own task: an action corrects what the frozen policy does, within the
-bound, and what is observed is what that policy sees and would do (`policies.residual`). TD3 with
-LayerNorm in its critics learns the correction μ; before its first update the frozen policy acts
-alone but for the noise. Its actor is held to the frozen policy: it climbs
+`CorrectionEnv` is the policy's own task. An action corrects what the frozen policy does, within the
+bound; the observation is what that policy sees and would do (`policies.residual`). TD3 with
+LayerNorm in its critics learns the correction μ. Before its first update only the frozen policy
+acts, apart from the noise. The actor is kept close to the frozen policy: it ascends
 
     λ1 ∇J - λ2 ∇ mean ‖μ‖²
 
     train_residual(ResidualRequest("outputs/train/grasp-…"), out)
 
-leaves a checkpoint of the policy `residual`, which holds the frozen policy's weights too. It is fed
-what that one is fed. Every training state begins new episodes, in a training that was killed as in
-one that was not; the folder, and which policy is kept, are those of `rl.train`.
+writes a checkpoint of the policy `residual`, which also holds the frozen policy's weights and has
+the same inputs. New episodes begin after every training state, whether or not the training was
+killed. The folder and the choice of the policy to keep are as in `rl.train`.
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
 
 PLAYED_EPISODES = 5
-"""Episodes of the frozen policy that give the statistics of what the correction sees."""
+"""Episodes of the frozen policy that give the statistics of the correction's input."""
 EVALUATED_AT_ONCE = 8
 BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -65,7 +65,7 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
     """The task of a frozen policy, whose actions are corrected; see the module's docstring.
 
     Args:
-        agent: the frozen policy's; it renders, encodes and measures what the policy is fed.
+        agent: the frozen policy's agent; it renders, encodes and measures the policy's inputs.
         policy: the frozen policy with an untrained correction.
         task: the task's config.
     """
@@ -83,7 +83,7 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Vector, dict[str, Any]]:
-        """Begin an episode from a training start; return what the correction sees."""
+        """Begin an episode from a training start; return the correction's input."""
         super().reset(seed=seed)
         start = int(self.np_random.integers(names.VALIDATION_SEED))
         seen, _ = self._env.reset(seed=start)
@@ -92,7 +92,7 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
         return self._sight(seen), {}
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Take one step by the frozen policy's action and its correction, (7,) in [-1, 1]."""
+        """Take one step with the frozen policy's action plus its correction, (7,) in [-1, 1]."""
         moved = np.clip(self._base + self._policy.bound * np.asarray(action), -1.0, 1.0)
         try:
             step = self._env.step(moved.astype(np.float32))
@@ -106,7 +106,7 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
         return self._sight(seen), reward, terminated, truncated, {"is_success": is_success}
 
     def _sight(self, seen: Any) -> Vector:
-        """Return what the correction sees of the present state, and keep the frozen action."""
+        """Return the correction's input in the present state; store the frozen policy's action."""
         agent = self._agent
         features = agent.features([seen])
         vectors = agent.vectors([self._env], [seen], [self._ticks])
@@ -124,14 +124,14 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
 
 @final
 class CorrectionTD3(AnchoredTD3):
-    """TD3 whose actor is held to no correction; see the module's docstring.
+    """TD3 whose actor is kept close to zero correction; see the module's docstring.
 
-    Its first steps are those of its policy with noise, not random actions: the policy of a
-    correction begins at none, so they are the frozen policy's.
+    Its first steps are its own policy's with noise, not random actions. The correction starts at
+    zero, so these steps are the frozen policy's.
     """
 
     def losses(self, batch: Any) -> dict[str, torch.Tensor]:
-        """Return the actor's loss and the mean square of the correction, in shares of the bound."""
+        """Return the actor's loss and the mean square of the correction, relative to the bound."""
         chosen = self.actor(batch.observations)
         values = self.critic.q1_forward(batch.observations, chosen)
         squares = chosen.square().sum(dim=1).mean()
@@ -146,16 +146,16 @@ class CorrectionTD3(AnchoredTD3):
 def train_residual(
     request: ResidualRequest, out: Path, *, progress: Progress | None = None
 ) -> Checkpoint:
-    """Train a correction, or go on where it was broken off.
+    """Train a correction, or resume an interrupted training.
 
     Args:
         request: what is trained.
         out: the checkpoint folder; new, or one of the same request.
-        progress: called with (control steps done, in all).
+        progress: called with (control steps done, control steps in total).
 
     Raises:
-        BadFile: a base that is no checkpoint.
-        InputError: a base that is no policy of behaviour cloning of one subtask.
+        BadFile: a base that is not a checkpoint.
+        InputError: a base that is not a behaviour-cloning policy of one subtask.
         OutputExists: `out` holds something else.
     """
     spec = base_of(request)
@@ -177,7 +177,7 @@ def train_residual(
 
 
 def base_of(request: ResidualRequest) -> PolicySpec:
-    """Return the policy that is corrected; see `train_residual` for the errors."""
+    """Return the policy to correct; see `train_residual` for the errors."""
     spec = open_policy(request.base)
     if spec.run.policy != "bc" or spec.run.task not in names.SUBTASKS:
         raise InputError(
@@ -190,12 +190,12 @@ def base_of(request: ResidualRequest) -> PolicySpec:
 
 
 def run_of(request: ResidualRequest, base: RunConfig, env_steps: int | None = None) -> RunConfig:
-    """Return the run that a request is.
+    """Return the run that a request describes.
 
     Args:
         request: what is trained.
-        base: the run of the policy that is corrected.
-        env_steps: control steps that it took; None before it has.
+        base: the run of the policy to correct.
+        env_steps: control steps taken; None before training.
     """
     return dataclasses.replace(
         base,
@@ -235,7 +235,7 @@ class _Training:
         self.model = self._model()
 
     def _played(self) -> Vector:
-        """Return what the correction sees in episodes of the frozen policy alone, (n, sight)."""
+        """Return the correction's input in episodes of the frozen policy alone, (n, sight)."""
         rows = []
         for episode in range(PLAYED_EPISODES):
             sight, _ = self.env.reset(seed=names.TRAIN_SEED + episode)
@@ -292,7 +292,7 @@ class _Training:
         return model
 
     def run(self, out: Path, progress: Progress) -> Checkpoint:
-        """Learn to the end, with an evaluation and a training state every so often."""
+        """Learn to the end, with periodic evaluations and training states."""
         request = self.request
         stages = Stages(request.env_steps, request.save_every, request.seed, out, progress)
         save = functools.partial(self._save, out)
@@ -300,11 +300,11 @@ class _Training:
         return self._write(best, kept, out)
 
     def _evaluate(self, minutes: float) -> tuple[Point, Weights]:
-        """Count successes of the policy as it is from validation starts; return its weights too."""
+        """Measure the present policy's successes from validation starts; return its weights too."""
         self.policy.take_correction(linear(self.model.actor.mu))
         rows = []
         if self.request.validation:
-            # Eval mode anew: the copy that acts is made of the present weights.
+            # Entering eval mode again makes a new copy to act, from the present weights.
             corrected = self.policy.eval()
             make = functools.partial(_corrected, self.spec, corrected)
             first = names.VALIDATION_SEED
@@ -324,7 +324,7 @@ class _Training:
         return point, {name: value.clone() for name, value in self.policy.state_dict().items()}
 
     def _save(self, out: Path, curve: Sequence[Point], best: Weights) -> None:
-        """Write the training state, whole."""
+        """Write the training state, atomically."""
         model = self.model
         buffer = cast(ReplayBuffer, model.replay_buffer)
         rows = buffer.buffer_size if buffer.full else buffer.pos
@@ -341,7 +341,7 @@ class _Training:
         write_state(out, state)
 
     def _resume(self, out: Path) -> tuple[list[Point], Weights]:
-        """Go on from the training state, if there is a whole one; return the curve and the best."""
+        """Resume from the training state, if complete; return the curve and the best weights."""
         state = read_state(out)
         if state is None:
             return [], {}
@@ -357,7 +357,7 @@ class _Training:
         return [Point(**point) for point in state["curve"]], state["best"]
 
     def _write(self, weights: Weights, kept: Point, out: Path) -> Checkpoint:
-        """Write the policy of these weights, those of the point that is kept."""
+        """Write the policy with these weights, which are those of the point kept."""
         if not all(torch.isfinite(weight).all() for weight in weights.values()):
             raise InputError("The correction diverged: weights are not finite; learn more slowly.")
         checkpoint = dataclasses.replace(
@@ -379,7 +379,7 @@ class _Training:
 
 
 def _corrected(spec: PolicySpec, policy: Residual) -> PolicyAgent:
-    """Make the agent of the frozen policy with the corrected one in its place."""
+    """Return the frozen policy's agent with the corrected policy instead."""
     agent = spec.make_agent()
     assert isinstance(agent, PolicyAgent)
     agent.policy = policy

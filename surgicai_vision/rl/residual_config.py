@@ -1,4 +1,4 @@
-"""What a residual policy is trained by, as data; light to import. See `rl.residual`."""
+"""How a residual policy is trained, as data; light to import. See `rl.residual`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -44,9 +44,9 @@ CORRECTION = Algorithm(
         "bc_weight": 0.1,
     },
 )
-"""TD3 as a correction is learned by. The noise is a share of the bound. Critics that have seen
-little send the actor anywhere within it, so they learn alone at first, and the actor is held to the
-frozen policy by `bc_weight` (docs/results/rl.md)."""
+"""TD3 for learning a correction. The noise is a share of the bound. Critics that have seen little
+send the actor anywhere within it, so only they learn at first, and `bc_weight` keeps the actor
+close to the frozen policy (docs/results/rl.md)."""
 BOUND = 0.3
 """Largest correction of each element of an action, by default."""
 
@@ -59,18 +59,18 @@ def residual_settings(changes: Mapping[str, JSON]) -> Settings:
 @final
 @dataclass(frozen=True)
 class ResidualRequest:
-    """Everything that decides a residual policy.
+    """Everything that determines a residual policy.
 
     Attributes:
-        base: checkpoint folder of the policy that is corrected, or `released:NAME`: behaviour
-            cloning of one subtask.
+        base: checkpoint folder of the policy to correct, or `released:NAME`; a behaviour-cloning
+            policy of one subtask.
         bound: largest correction of each element of an action.
-        settings: of TD3.
-        changes: which of them were changed, "key=value" each; they name the run.
+        settings: TD3's settings.
+        changes: the settings that were changed, "key=value" each; they enter the run's name.
         env_steps: control steps taken in the env.
-        seed: of the correction, batches, noise and starts.
-        validation: episodes of each evaluation on the way, from validation starts.
-        save_every: control steps from one evaluation and training state to the next.
+        seed: seed of the correction, batches, noise and starts.
+        validation: episodes of each evaluation during training, from validation starts.
+        save_every: control steps between evaluations and training states.
     """
 
     base: str

@@ -2,9 +2,9 @@
 
 Ball et al., Efficient online reinforcement learning with offline data (ICML 2023,
 arXiv:2302.02948): SAC off the shelf, half of every batch from offline data (`buffers`), and
-LayerNorm after each hidden layer of the critics, which bounds the values of actions that no data
-show. Their ensembles of ten critics and 20 updates a step are settings (`critics`, `updates`).
-`residual` has such critics in TD3.
+LayerNorm after each hidden layer of the critics, which bounds the values of actions absent from the
+data. Their ensembles of ten critics and 20 updates per step are settings (`critics`, `updates`).
+`residual` uses such critics in TD3.
 """
 
 from typing import Any, final
@@ -16,7 +16,7 @@ from torch import nn
 
 
 class LayerNormCritics:
-    """A policy of Stable-Baselines3 with LayerNorm in its critics; mixed in before its class."""
+    """A mixin, placed before a Stable-Baselines3 policy, that adds LayerNorm to its critics."""
 
     def make_critic(self, features_extractor: Any = None) -> ContinuousCritic:
         """Return the library's critics with LayerNorm between each hidden layer and its ReLU."""

@@ -1,4 +1,4 @@
-"""Settings of all algorithms, and what a training is asked for, as frozen data."""
+"""Settings of all algorithms, and the request of a training, as frozen data."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -21,48 +21,48 @@ STOP_AFTER = 2
 class Settings:
     """Settings; each algorithm reads those that `Algorithm.settings` names.
 
-    The paper is SurgicAI's (appendix), the code its release. Where nothing is said the default is
+    "Paper" means SurgicAI's appendix, "code" its release. Where neither is named, the default is
     the library's.
 
     Attributes:
         hidden: width of each hidden layer of actor and critics (paper 4 × 256, code 3 × 256).
-        learning_rate: Adam's (code 2e-4).
-        gamma: discount a decision (paper .99, code .995).
-        batch_size: transitions an update (code 256).
-        envs: envs that are stepped at a time; the number of worker processes changes no result.
+        learning_rate: Adam's learning rate (code 2e-4).
+        gamma: discount per decision (paper .99, code .995).
+        batch_size: transitions per update (code 256).
+        envs: envs stepped at the same time; the number of worker processes changes no result.
         tau: Polyak factor of the target networks (code .005).
-        train_every: steps of an env from update to update.
+        train_every: steps of an env between updates.
         updates: updates each time, for each env.
-        learning_starts: env steps by random actions before the first update; 0 takes 1,000, with
-            demonstrations one episode.
-        critics: number of critics, of which the smallest counts.
+        learning_starts: env steps with random actions before the first update; 0 takes 1,000, or
+            one episode if that is longer; with demonstrations one episode.
+        critics: number of critics; the smallest of their values is used.
         exploration_noise: standard deviation of the noise on actions (code .05).
-        actor_starts: updates of the critics before the actor's first; a correction's.
-        policy_delay: updates of the critics for one of the actor (code 2).
+        actor_starts: critic updates before the actor's first update, for a correction.
+        policy_delay: critic updates per actor update (code 2).
         target_noise: standard deviation of the noise on the target's action (code .2).
-        target_noise_clip: where it is clipped (code .5).
-        goals: relabelled transitions for each real one (paper 3, code 4); a future state's goal.
-        relabel_demand: what a relabelled goal asks for besides the pose: "achieved", what then
-            held, as in the paper; "kept", what the task asks for; "auto" keeps it where the task
-            asks for holes or for the needle being out, which "go there" would else replace.
+        target_noise_clip: limit to which that noise is clipped (code .5).
+        goals: relabelled transitions for each real one (paper 3, code 4), using future states.
+        relabel_demand: what a relabelled goal requires besides the pose: "achieved", what held at
+            that time, as in the paper; "kept", what the task requires; "auto" keeps it if the task
+            requires holes or the needle being out, which "go there" would otherwise replace.
         demo_share: share of a batch that is drawn from the demonstrations (code .3).
-        bc_weight: λ2, weight of the cloning loss; λ1 = 1 - λ2 is that of the critic's (paper .2,
-            .5, .8; .5 by default). Of a correction's actor the frozen policy is what is cloned.
+        bc_weight: λ2, weight of the cloning loss; λ1 = 1 - λ2 is that of the critic's value (paper
+            .2, .5, .8; .5 by default). For a correction's actor, the frozen policy is cloned.
         q_filter: clone only where the critic values the demonstrated action above the actor's.
-        normalise_q: divide the critic's value in the actor's loss by its mean size, so that λ2
-            weighs the same at every scale of reward (Fujimoto and Gu, A minimalist approach to
-            offline reinforcement learning, NeurIPS 2021).
-        clip_q: clip targets to the range of a return of the reward, [-1 / (1 - γ), 0].
-        rollout: steps of all envs from update to update (PPO).
-        samples: actions sampled a state by BCQ and Cal-QL (their papers' code: 100 and 10).
+        normalise_q: divide the critic's value in the actor's loss by its mean absolute value, so
+            that λ2 has the same effect at every scale of reward (Fujimoto and Gu, A minimalist
+            approach to offline reinforcement learning, NeurIPS 2021).
+        clip_q: clip targets to the possible returns of the reward, [-1 / (1 - γ), 0].
+        rollout: steps of all envs between updates (PPO).
+        samples: actions sampled per state by BCQ and Cal-QL (their papers' code: 100 and 10).
         stop_at: share of validation starts; learning ends once `STOP_AFTER` evaluations in a row
-            have solved so many. With 0 it goes on to the last step.
+            have solved this share. With 0 it continues to the last step.
         success_steps: `SuccessRule.steps`, for an episode of learning or a demonstration. With 1,
-            the paper's, nothing is learned of what comes after, and the next subtask of a whole
-            procedure finds it unfinished.
-        tolerance_share: `SuccessRule.tolerance_share`. With 1, the paper's, an actor learns to stop
-            at the edge of the tolerance.
-        keeps_holes: `SuccessRule.keeps_holes`. Without, as in the paper, an actor may learn
+            the paper's value, nothing is learned about what comes after, and the next subtask of a
+            whole procedure finds the previous one unfinished.
+        tolerance_share: `SuccessRule.tolerance_share`. With 1, the paper's value, an actor learns
+            to stop at the edge of the tolerance.
+        keeps_holes: `SuccessRule.keeps_holes`. If False, as in the paper, an actor may learn
             handoffs that pull the needle out of the tissue.
     """
 
@@ -122,27 +122,27 @@ class Settings:
 
     @property
     def success_rule(self) -> SuccessRule:
-        """What a success asks for in learning beyond the paper's."""
+        """What a success requires in learning beyond the paper's rule."""
         return SuccessRule(self.success_steps, self.tolerance_share, self.keeps_holes)
 
 
 @final
 @dataclass(frozen=True)
 class Request:
-    """Everything that decides the result of a training.
+    """Everything that determines the result of a training.
 
     Attributes:
         algo: a key of `ALGORITHMS`.
         env: the task, with its options.
-        observation: "relative" or "state", what the policy is fed.
-        settings: as they are, defaults of the algorithm included.
-        changes: which of them were changed, "key=value" each; they name the run.
+        observation: the policy's input, "relative" or "state".
+        settings: all settings, including the algorithm's defaults.
+        changes: the settings that were changed, "key=value" each; they enter the run's name.
         env_steps: control steps taken in the env; 0 for offline algorithms.
         updates: updates of offline algorithms; 0 online.
-        seed: of networks, batches, noise and starts.
-        demonstrations: how many it learns from; 0 for none.
+        seed: seed of networks, batches, noise and starts.
+        demonstrations: number of demonstrations it learns from; 0 for none.
         demos: sha256 over their files.
-        validation: episodes of each evaluation on the way, from validation starts.
+        validation: episodes of each evaluation during training, from validation starts.
         save_every: control steps (offline: updates) between evaluations and training states.
     """
 
@@ -203,7 +203,7 @@ class Request:
 
     @property
     def keeps_demand(self) -> bool:
-        """Whether a relabelled goal keeps asking for what the task asks for."""
+        """Whether a relabelled goal keeps the requirement of the task."""
         if self.settings.relabel_demand != "auto":
             return self.settings.relabel_demand == "kept"
         demands = load_subtask(self.env.task).demands[self.env.tolerance]
@@ -226,7 +226,7 @@ def settings_of(algo: str, changes: Mapping[str, JSON]) -> Settings:
 
 
 def changed_settings(algorithm: Algorithm, name: str, changes: Mapping[str, JSON]) -> Settings:
-    """Return the settings of an algorithm of that name with changes; see `settings_of`."""
+    """Return the settings of the algorithm with this name, with changes; see `settings_of`."""
     for key in changes:
         if key not in algorithm.settings:
             raise UnknownName(f"setting of '{name}'", key, algorithm.settings)

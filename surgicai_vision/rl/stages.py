@@ -1,10 +1,10 @@
-"""A training in stages: learn some steps, evaluate, keep the best policy, store the state.
+"""A training in stages: learn for some steps, evaluate, keep the best policy, store the state.
 
     stages = Stages(20_000, save_every=2_500, seed=0, out=out)
     weights, kept = stages.run(model, begun, evaluate, save)
 
-Every stage begins new episodes, from start seeds of its own, in a training that was killed as in
-one that was not; so nothing of the env need be stored.
+Every stage begins new episodes from its own start seeds, whether or not the training was killed. So
+no state of the env needs to be stored.
 """
 
 import dataclasses
@@ -27,14 +27,14 @@ SEEDS_EACH = 1000
 
 @dataclass(frozen=True)
 class Stages:
-    """How long is learned, and how often it is evaluated and stored.
+    """How long to learn, and how often to evaluate and store.
 
     Attributes:
-        steps: steps of the model's env in all.
+        steps: total steps of the model's env.
         save_every: steps of one stage.
         seed: the training seed.
         out: folder of the training; the curve is written there after every stage.
-        progress: called with (steps done, steps in all).
+        progress: called with (steps done, steps in total).
     """
 
     steps: int
@@ -53,16 +53,16 @@ class Stages:
         """Learn to the end.
 
         Args:
-            model: what learns; its `num_timesteps` say how far it is.
-            begun: the curve so far and the weights of its best point; empty in the beginning.
+            model: the model that learns; its `num_timesteps` is its progress.
+            begun: the curve so far and the weights of its best point; empty at the start.
             evaluate: CPU minutes of learning so far → the point of the curve, and the weights of
-                the policy that it counts.
+                the policy that was evaluated.
             save: writes the training state of a curve and its best weights.
 
         Returns:
             The weights of the best point, and that point.
         """
-        model.set_logger(Logger(None, []))  # without one `learn` makes a folder for it at each call
+        model.set_logger(Logger(None, []))  # without it `learn` creates a log folder at each call
         curve, best = begun
         minutes = curve[-1].minutes if curve else 0.0
         while model.num_timesteps < self.steps:

@@ -1,12 +1,13 @@
 """Train by reinforcement or offline learning: from a request to a checkpoint.
 
-`train(request, demos, out)` goes on where it was broken off: a kill costs at most the steps since
-the last training state, and the result is what it would have been. See the package's docstring for
+`train(request, demos, out)` resumes an interrupted training: a kill loses at most the steps since
+the last training state, and the result is the same as without it. See the package's docstring for
 the folder.
 
-The policy that is kept is that of the evaluation with the most successes from validation starts,
-of equals the last: learning goes up and down, and where it happens to end says little. Without
-`validation` it is the last. With the setting `stop_at` learning ends early, once it is solved.
+The policy kept is that of the evaluation with the most successes from validation starts; among
+equals, the last. Success fluctuates during learning, and where it happens to end says little.
+Without `validation` the last policy is kept. With the setting `stop_at` learning ends early, once
+the task is solved.
 """
 
 import dataclasses
@@ -45,15 +46,15 @@ from surgicai_vision.training.threads import one_thread
 
 CURVE = "curve.json"
 IMAGE_SIZE = 224
-"""Of a checkpoint without images; nothing reads it."""
+"""Recorded in a checkpoint without images; nothing reads it."""
 SMALLEST_STD = 0.1
-"""Inputs that vary less (cm, rad or a share) are divided by this: exploration leaves the narrow way
-of the demonstrations, and would see inputs of many standard deviations."""
+"""Inputs that vary less (cm, rad or a share) are divided by this: exploration leaves the narrow
+path of the demonstrations, and would otherwise see inputs of many standard deviations."""
 CONSTANT_STD = 1e-6
-"""Inputs that vary less are constant and divided by 1: the goals of demonstrations ask for contact
-or holes, those that hindsight relabels mostly do not, and would lie ten deviations away."""
+"""Inputs that vary less count as constant and are divided by 1: the goals of demonstrations require
+contact or holes; relabelled goals mostly do not, and would otherwise lie ten deviations away."""
 RANDOM_EPISODES = 5
-"""Episodes of random actions that give the statistics of the inputs without demonstrations."""
+"""Episodes of random actions that give the input statistics if there are no demonstrations."""
 EVALUATED_AT_ONCE = 10
 Weights = Mapping[str, torch.Tensor]
 """Names → parameters of an actor."""
@@ -66,8 +67,8 @@ class Point:
     Attributes:
         env_steps: control steps taken in the env so far.
         updates: updates of the weights so far.
-        minutes: CPU time of learning so far in this process, evaluations left out; what worker
-            processes of envs take is not in it.
+        minutes: CPU time of learning so far in this process, without evaluations and without the
+            worker processes of envs.
         successes: episodes that succeeded.
         episodes: episodes evaluated, from validation starts.
         distance_mm: median distance to the goal at their end.
@@ -90,15 +91,15 @@ def train(
     progress: Progress | None = None,
     tensorboard: bool = True,
 ) -> Checkpoint:
-    """Train, or go on where it was broken off, and write the checkpoint.
+    """Train, or resume an interrupted training, and write the checkpoint.
 
     Args:
         request: what is trained.
-        demos: files of the demonstrations; none for an algorithm without.
+        demos: files of the demonstrations; empty for an algorithm that uses none.
         out: the checkpoint folder; new, or one of the same request.
         workers: worker processes that step the envs; they change no result.
-        progress: called with (control steps or updates done, in all).
-        tensorboard: draw curves into `<out>-tensorboard`.
+        progress: called with (control steps or updates done, in total).
+        tensorboard: write curves to `<out>-tensorboard`.
 
     Raises:
         InputError: the extra is not installed, or demonstrations of another env.
@@ -127,7 +128,7 @@ def train_seeds(
     progress: Progress | None = None,
     tensorboard: bool = True,
 ) -> None:
-    """Train several requests, side by side in `workers` processes; see `train`.
+    """Train several requests in parallel, in `workers` processes; see `train`.
 
     A single one is trained in this process, and the workers step its envs.
     """
@@ -156,7 +157,7 @@ def _train_reporting(
     tensorboard: bool,
     report: Callable[[int], None],
 ) -> None:
-    """Train in a worker process; `report` is told the steps done."""
+    """Train in a worker process; `report` is called with the steps done."""
 
     def show(done: int, total: int, unit: str = "", /) -> None:
         report(done)
@@ -170,7 +171,7 @@ def _show(progress: Progress, before: int, total: int, steps: Sequence[int]) -> 
 
 
 def _packages(request: Request) -> tuple[str, ...]:
-    """Return what must be installed: curves are logged by Stable-Baselines3 in any case."""
+    """Return the packages that are needed: Stable-Baselines3 logs the curves in any case."""
     return ("stable_baselines3", request.algorithm.library)
 
 
@@ -196,7 +197,7 @@ def _learner(request: Request, demos: Sequence[Path], workers: int) -> Learner:
 def _statistics(
     request: Request, transitions: Transitions | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean and standard deviation of the inputs: of demonstrations, else of random play."""
+    """Return mean and standard deviation of inputs: of demonstrations, else of random actions."""
     if transitions is None:
         rows = _random_play(request)
     elif transitions.is_goal:
@@ -216,7 +217,7 @@ def _statistics(
 
 
 def _random_play(request: Request) -> NDArray[np.float32]:
-    """Return what episodes of random actions observe, (n, inputs)."""
+    """Return the observations in episodes of random actions, (n, inputs)."""
     env = envs.make(request.env, request.observation)
     rng = np.random.default_rng(request.seed)
     rows = []
@@ -239,7 +240,7 @@ def _run(
     progress: Progress | None,
     tensorboard: bool,
 ) -> Checkpoint:
-    """Learn to the end, with an evaluation and a training state every so often."""
+    """Learn to the end, with periodic evaluations and training states."""
     curve, best = _resume(learner, out)
     log = _Log(out if tensorboard else None, learner)
     minutes = curve[-1].minutes if curve else 0.0
@@ -291,19 +292,19 @@ class CurvePoint(Protocol):
 
 
 def best_point[P: CurvePoint](curve: Sequence[P]) -> P:
-    """Return the point whose policy is kept: the most successes, of equals the last."""
+    """Return the point whose policy is kept: the most successes; among equals, the last."""
     return max(reversed(curve), key=lambda point: point.successes)
 
 
 def _save(learner: Learner, curve: Sequence[Point], best: Weights, out: Path) -> None:
-    """Write the training state, whole."""
+    """Write the training state, atomically."""
     points = [dataclasses.asdict(point) for point in curve]
     state = {"learner": learner.get_state(), "curve": points, "best": dict(best)}
     write_state(out, state)
 
 
 def _resume(learner: Learner, out: Path) -> tuple[list[Point], Weights]:
-    """Go on from the training state, if there is a whole one; return the curve and the best."""
+    """Resume from the training state, if it is complete; return the curve and the best weights."""
     state = read_state(out)
     if state is None:
         return [], {}
@@ -312,7 +313,7 @@ def _resume(learner: Learner, out: Path) -> tuple[list[Point], Weights]:
 
 
 class _Log:
-    """Draws curves for TensorBoard, by Stable-Baselines3's logger; nothing without a folder."""
+    """Writes curves for TensorBoard with Stable-Baselines3's logger, if there is a folder."""
 
     def __init__(self, out: Path | None, learner: Learner):
         self._logger: Any = None
@@ -347,7 +348,7 @@ class _Log:
 
 
 def actor_recipe(request: Request, squash: str) -> ActorRecipe:
-    """Return what a checkpoint says of its actor."""
+    """Return the recipe that a checkpoint records of its actor."""
     return ActorRecipe(
         hidden=request.settings.hidden,
         learning_rate=request.settings.learning_rate,
@@ -362,7 +363,7 @@ def actor_recipe(request: Request, squash: str) -> ActorRecipe:
 
 
 def actor_of(request: Request, learner: Learner) -> Policy:
-    """Return the learner's actor as a policy of ours."""
+    """Return the learner's actor as one of our policies."""
     actor = policy_plugin(request.algorithm.policy).make(actor_recipe(request, learner.squash), ())
     learner.fill(actor)
     actor.eval().requires_grad_(False)
@@ -370,7 +371,7 @@ def actor_of(request: Request, learner: Learner) -> Policy:
 
 
 def _evaluate(request: Request, actor: Policy, learner: Learner, minutes: float) -> Point:
-    """Count successes from validation starts, with the generators left as they are."""
+    """Measure successes from validation starts, leaving the generators unchanged."""
     steps = learner.done if request.algorithm.is_online else 0
     if not request.validation:
         return Point(steps, learner.updates, minutes, 0, 0, 0.0)
@@ -397,7 +398,7 @@ def _evaluate(request: Request, actor: Policy, learner: Learner, minutes: float)
 
 
 def run_of(request: Request) -> RunConfig:
-    """Return the run that a request is."""
+    """Return the run that a request describes."""
     return RunConfig(
         env=request.env,
         policy=request.algorithm.policy,
@@ -413,7 +414,7 @@ def run_of(request: Request) -> RunConfig:
 
 
 def _write(request: Request, weights: Weights, squash: str, kept: Point, out: Path) -> Checkpoint:
-    """Write the actor of these weights, those of the point that is kept."""
+    """Write the actor with these weights, which are those of the point kept."""
     if not all(torch.isfinite(weight).all() for weight in weights.values()):
         raise InputError(
             f"'{request.algo}' diverged: weights are not finite; lower the learning rate."

@@ -1,15 +1,15 @@
 """Transitions: demonstrations as reinforcement learning reads them.
 
-A demonstration holds states and actions, no observations. `of_demos` replays its executed actions
-from its first state in an env that shows what is wanted, so that every transition is what that env
-gives: replayed once more it gives the same reward and next observation, bit for bit.
+A demonstration holds states and actions, but no observations. `of_demos` replays its executed
+actions from its first state in an env with the requested observations. Every transition is
+therefore the env's own: another replay gives the same reward and next observation, bit for bit.
 
     transitions = of_demos(list_demos(folder), TaskConfig("grasp"), "goal")
     transitions.observation["desired_goal"], transitions.action, transitions.reward, …
 
-An episode ends with its first success, as the env ends it; what was recorded after it is left out.
-With `action_repeat` the replay takes the mean of so many actions, and with `hold_jaw` the jaw's
-action is 0; the few demonstrations that then fail are left out and counted.
+An episode ends with its first success, as in the env; what was recorded after it is left out. With
+`action_repeat` the replay uses the mean of that many actions, and with `hold_jaw` the jaw's action
+is 0; the few demonstrations that then fail are left out and counted.
 """
 
 import io
@@ -34,7 +34,7 @@ from surgicai_vision.envs.base import Observation, SuturingEnv
 OBSERVATION = "observation"
 """Key of an observation that is one array, and of the proprioception of a goal dict."""
 OBS_TYPES = ("relative", "state", "goal")
-"""What transitions may show: arrays of numbers."""
+"""Observation types that transitions may have: arrays of numbers."""
 VERSION = 1
 
 Arrays = Mapping[str, NDArray[np.float32]]
@@ -48,10 +48,10 @@ class Transitions:
     Attributes:
         config: the task, with the options of the env.
         obs_type: what is observed, one of `OBS_TYPES`.
-        observation: key → (N, …) float32 before each action; of obs_type "goal" its three parts,
-            else the one key `OBSERVATION`.
+        observation: key → (N, …) float32 before each action; for obs_type "goal" its three parts,
+            otherwise only the key `OBSERVATION`.
         next_observation: the same after it.
-        action: what was executed, (N, 7) float32.
+        action: the executed actions, (N, 7) float32.
         reward: (N,) float32.
         terminated: the task was solved, (N,) bool.
         truncated: the episode or the recording ended otherwise, (N,) bool.
@@ -120,10 +120,10 @@ def of_demos(
     Args:
         paths: episode files.
         config: the env they are replayed in; reward, tolerance, limit and options may differ from
-            those they were recorded in. None takes the recorded one.
+            those they were recorded in. None uses the recorded one.
         obs_type: what is observed, one of `OBS_TYPES`.
-        progress: called with (demonstrations done, in all).
-        success_rule: what a success asks for beyond the paper's.
+        progress: called with (demonstrations done, in total).
+        success_rule: what a success requires beyond the paper's rule.
 
     Raises:
         InputError: demonstrations of another task, scene, step size or randomisation, or none that
@@ -186,7 +186,7 @@ class _Episode:
 
 
 def _check(path: Path, demo: Demo, env: SuturingEnv) -> None:
-    """Refuse a demonstration of another env than the one it is to be replayed in."""
+    """Refuse a demonstration recorded in another env than the one it is to be replayed in."""
     for name in ("task", "step", "randomisation"):
         recorded = getattr(demo.config, name)
         wanted = getattr(env.config, name)
@@ -203,7 +203,7 @@ def _check(path: Path, demo: Demo, env: SuturingEnv) -> None:
 
 
 def _replay(env: SuturingEnv, demo: Demo) -> _Episode:
-    """Take a demonstration's executed actions from its first state to its success."""
+    """Replay a demonstration's executed actions from its first state to its success."""
     executed = demo.action if demo.executed is None else demo.executed
     repeat = env.config.action_repeat
     env.set_state_vector(demo.state[0])
@@ -226,7 +226,7 @@ def _replay(env: SuturingEnv, demo: Demo) -> _Episode:
 
 
 def _joined(parts: Sequence[Sequence[Observation]]) -> dict[str, NDArray[np.float32]]:
-    """Return observations, episode by episode, as one array a key."""
+    """Return observations, episode by episode, as one array per key."""
     rows = [
         row if isinstance(row, Mapping) else {OBSERVATION: row} for part in parts for row in part
     ]
@@ -234,13 +234,13 @@ def _joined(parts: Sequence[Sequence[Observation]]) -> dict[str, NDArray[np.floa
 
 
 def _last(steps: int) -> NDArray[np.bool_]:
-    """Return (steps,) bool, True at the end alone."""
+    """Return (steps,) bool, True only at the end."""
     last: NDArray[np.bool_] = np.arange(steps) == steps - 1
     return last
 
 
 def write_transitions(path: Path, transitions: Transitions) -> None:
-    """Write transitions as one npz file: an array a field, an observation's key after a dot."""
+    """Write transitions as one npz file: one array per field, observation keys after a dot."""
     content = io.BytesIO()
     about = {
         "version": VERSION,

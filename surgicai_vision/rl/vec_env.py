@@ -6,7 +6,7 @@
 It adapts `envs.vector_env`: trajectories are the same with any number of workers. Infos hold what
 Stable-Baselines3 reads: `terminal_observation`, `TimeLimit.truncated`, and the return, length and
 success of an ended episode. `compute_reward` and `compute_terminated`, which hindsight relabelling
-asks for in each batch, are answered in this process.
+calls for each batch, run in this process.
 """
 
 import time
@@ -86,7 +86,7 @@ class SuturingVecEnv(VecEnv):
     # -- stepping ----------------------------------------------------------------------------------
 
     def reset(self) -> VecEnvObs:
-        """Reset all envs; seeds of `seed` and options are used once."""
+        """Reset all envs; seeds set by `seed` and options are used only once."""
         observation, info = self._vector.reset(seed=list(self._seeds))
         self.reset_infos = _rows(info, self.num_envs)
         self._returns[:] = 0.0
@@ -132,10 +132,10 @@ class SuturingVecEnv(VecEnv):
         self._vector.close()
         self._local.close()
 
-    # -- the whole state ---------------------------------------------------------------------------
+    # -- the complete state ------------------------------------------------------------------------
 
     def get_state(self) -> tuple[list[Snapshot], NDArray[np.float64], NDArray[np.int64]]:
-        """Return what the next step depends on: envs, returns and lengths so far."""
+        """Return everything the next step depends on: envs, returns and lengths so far."""
         snapshots = cast(list[Snapshot], self.get_attr("snapshot"))
         return snapshots, self._returns.copy(), self._lengths.copy()
 
@@ -161,7 +161,7 @@ class SuturingVecEnv(VecEnv):
         return [values[index] for index in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all envs, and of the one that answers for them in this process."""
+        """Set an attribute of all envs, and of the one that represents them in this process."""
         if len(list(self._chosen(indices))) != self.num_envs:
             raise InputError("set_attr sets an attribute of all envs; leave indices out.")
         self._vector.set_attr(attr_name, [value] * self.num_envs)
@@ -183,7 +183,7 @@ class SuturingVecEnv(VecEnv):
         return [values[index] for index in chosen]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Return False for each env: they tell of their episodes without a wrapper."""
+        """Return False for each env: they report their episodes without a wrapper."""
         return [False for _ in self._chosen(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:

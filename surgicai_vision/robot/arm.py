@@ -1,16 +1,16 @@
 """Arm: what a CRTK command does to one arm, without ROS and without physics.
 
     arm.receive("servo_cp", message, source, now)   # validate and queue; InputError: refused
-    target = arm.advance(time, state)               # every control step: obey, and say what is due
+    target = arm.advance(time, state)               # every control step: obey, return the target
 
-After docs/ros_crtk_contract.md of dvrk_simulator_base: "Servo commands are superseding depth-one
+As in docs/ros_crtk_contract.md of dvrk_simulator_base: "Servo commands are superseding depth-one
 setpoints. Move and state commands remain ordered in a bounded queue. Invalid commands and queue
 overflow produce a warning without mutating backend state."
 
-Beyond the contract, since a wrong set point moves a robot: a motion command is refused that bears a
-stamp older than `MAX_AGE_S`, or older than one already obeyed; and where two clients move one arm
-within `CONTROL_S` of each other, it pauses until `resume`. A message without a stamp is as old as
-its arrival.
+Beyond the contract, since a wrong set point moves a robot: a motion command is refused if its stamp
+is older than `MAX_AGE_S`, or older than that of a command already accepted. If two clients move one
+arm within `CONTROL_S` of each other, it pauses until `resume`. A message without a stamp is as old
+as its arrival.
 
 An arm that may not move stays where it was measured; its jaw keeps its set point, so that what it
 holds is not dropped.
@@ -32,25 +32,25 @@ from surgicai_vision.robot.trajectory import Trajectory, is_within
 from surgicai_vision.scene.kinematics import INSTRUMENTS, Joints, Pose, inverse_flat
 
 QUEUE = 32
-"""Move and state commands that may wait (dvrk_simulator_base/command_mailbox.py)."""
+"""Most move and state commands that may wait (dvrk_simulator_base/command_mailbox.py)."""
 MAX_AGE_S = 0.25
-"""Age past which a motion command is late (share/arms/PSM.yaml: command_timeout_s)."""
+"""Age beyond which a motion command is late (share/arms/PSM.yaml: command_timeout_s)."""
 CONTROL_S = 0.5
-"""Time for which whoever moved an arm last is the one who moves it [s]."""
+"""Time for which the client that last moved an arm keeps control of it [s]."""
 MOVE_SPEEDS = (0.5, 0.5, 0.05, 1.75, 1.75, 1.75)
 """Highest speeds of `move_jp` and `move_cp` [rad/s, the third m/s].
 
-The insertion's and the wrist's are 1 mm and 2° a control step, within the envs' own step sizes; the
-first two move the tip as fast 100 mm below the remote centre. A dVRK allows ten times as much
-(share/arms/PSM.yaml).
+Those of insertion and wrist are 1 mm and 2° per control step, within the envs' own step sizes. The
+first two joints move the tip as fast as the insertion does when it is 100 mm below the remote
+centre. A dVRK allows ten times as much (share/arms/PSM.yaml).
 """
 JAW_SPEED = 2.5
-"""Highest speed of `jaw/move_jp` [rad/s], 0.05 rad of the angle between the fingers a step."""
+"""Highest speed of `jaw/move_jp` [rad/s], 0.05 rad of the angle between the fingers per step."""
 FINGER_SHARE = CONVENTIONS["dvrk"].jaw_scale
-"""One finger's angle over a dVRK's jaw angle, which is that between the fingers."""
+"""Ratio of one finger's angle to a dVRK's jaw angle, which is that between the fingers."""
 JAW_LIMITS = (-0.349066, JAW_OPEN / FINGER_SHARE)
-"""Jaw angles that are taken [rad]: the lower one is a dVRK's (share/arms/PSM.yaml), whose commands
-below 0 press a closed jaw; ours presses by itself (`envs.control.SQUEEZE`), so they mean 0."""
+"""Accepted jaw angles [rad]. The lower limit is a dVRK's (share/arms/PSM.yaml), where commands
+below 0 squeeze a closed jaw; ours squeezes by itself (`envs.control.SQUEEZE`), so they mean 0."""
 JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 """Joints of a PSM as share/arms/PSM.yaml names them."""
 JAW_NAME = "jaw"
@@ -70,15 +70,15 @@ SERVOS = (SERVO_JP, SERVO_CP, JAW_SERVO_JP)
 
 @dataclass(frozen=True)
 class ArmState:
-    """What is measured of a PSM, and where it is told to be.
+    """The measured state of a PSM, and its set points.
 
     Attributes:
-        joints: measured [rad, m].
-        velocity: of them [rad/s, m/s].
+        joints: measured joints [rad, m].
+        velocity: their velocities [rad/s, m/s].
         jaw: measured angle between the fingers [rad].
-        jaw_velocity: of it [rad/s].
-        setpoint: joints it is told to be at.
-        jaw_setpoint: jaw angle it is told [rad].
+        jaw_velocity: its velocity [rad/s].
+        setpoint: set points of the joints [rad, m].
+        jaw_setpoint: set point of the jaw angle [rad].
     """
 
     joints: Joints
@@ -91,7 +91,7 @@ class ArmState:
 
 @dataclass(frozen=True)
 class Target:
-    """Where a PSM is told to be: six joints [rad, m] and the angle between the fingers [rad]."""
+    """The set point of a PSM: six joints [rad, m] and the angle between the fingers [rad]."""
 
     joints: Joints
     jaw: float
@@ -99,7 +99,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Note:
-    """What an arm has to say, on its topic "info", "warning" or "error"."""
+    """A text for an arm's topic "info", "warning" or "error"."""
 
     level: str
     text: str
@@ -113,7 +113,7 @@ class Arm(Protocol):
     notes: list[Note]
 
     def receive(self, channel: str, message: Message, source: str, now: int) -> None:
-        """Queue a command that arrived at `now` [ns]; InputError: it is refused."""
+        """Queue a command that arrived at `now` [ns]; InputError if it is refused."""
 
     @property
     def is_busy(self) -> bool:
@@ -122,7 +122,7 @@ class Arm(Protocol):
 
 @dataclass(frozen=True)
 class _Command:
-    """A queued command: its channel and what it asks for."""
+    """A queued command: its channel and what it requests."""
 
     channel: str
     payload: "Joints | Pose | float | str"
@@ -136,13 +136,13 @@ class Psm:
         name: "PSM1" or "PSM2", the first part of its topics.
         base: T_world_base.
         instrument: its instrument, a key of `INSTRUMENTS`.
-        max_age: age past which a motion command is late [s]; None: of any age, where the client
-            sets the clock.
+        max_age: age beyond which a motion command is late [s]; None: any age is accepted, since
+            the client sets the clock.
 
     Attributes:
         operating: its operating state.
         frames: the frames of its Cartesian messages.
-        notes: what it has to say; whoever publishes them empties the list.
+        notes: texts to publish; whoever publishes them empties the list.
     """
 
     def __init__(self, name: str, base: Pose, instrument: str, max_age: float | None = MAX_AGE_S):
@@ -186,7 +186,7 @@ class Psm:
             now: when it arrived [ns since the epoch].
 
         Raises:
-            InputError: it is refused; nothing has changed.
+            InputError: the command is refused; nothing has changed.
         """
         payload = self._readers[channel](message)
         if channel in MOTIONS:
@@ -201,21 +201,21 @@ class Psm:
         self._queue.append(_Command(channel, payload))
 
     def stop(self, reason: str) -> None:
-        """Fault: the arm stays where it is until `clear_fault` and `enable`."""
+        """Enter FAULT: the arm stays where it is until `clear_fault` and `enable`."""
         self.operating.state = FAULT
         self.notes.append(Note("error", reason))
         self._forget_motions()
 
     def forget(self) -> None:
-        """Forget all motions that are under way or wait; the operating state stays."""
+        """Forget all motions that are under way or waiting; the operating state stays."""
         self._forget_motions()
 
     def advance(self, time: float, state: ArmState) -> Target | None:
-        """Obey what is queued and return where the arm is told to be, None for no change.
+        """Obey queued commands and return the arm's new set point, None for no change.
 
         Args:
-            time: of the control step [s]; moves keep it.
-            state: what is measured now.
+            time: time of the control step [s], which moves follow.
+            state: the state measured now.
         """
         joints = state.setpoint
         jaw = state.jaw_setpoint
@@ -251,7 +251,7 @@ class Psm:
     def _begin(
         self, command: _Command, joints: Joints, jaw: float, time: float
     ) -> tuple[Joints, float]:
-        """Begin a motion and return the set points it leads to now."""
+        """Begin a motion and return the set points for now."""
         channel = command.channel
         payload = command.payload
         if isinstance(payload, float):
@@ -291,12 +291,12 @@ class Psm:
         return inverse_flat(pose, self.instrument, near)
 
     def _forget_motions(self) -> None:
-        """Drop moves and all motions that wait."""
+        """Drop moves and all waiting motions."""
         self._trajectory = self._jaw_trajectory = None
         self._queue = deque(entry for entry in self._queue if entry.channel == STATE_COMMAND)
 
     def _check_time(self, channel: str, message: Message, now: int) -> None:
-        """Refuse a motion command that is late, or older than one already taken."""
+        """Refuse a motion command that is late, or older than one already accepted."""
         assert isinstance(message, JointState | PoseStamped)
         stamp = message.header.stamp
         if not stamp:
@@ -346,7 +346,7 @@ class Psm:
 
 @final
 class Endoscope:
-    """The ECM of a scene whose endoscope stands still: it has a state and refuses to move.
+    """The ECM of a scene whose endoscope is fixed: it has a state and refuses to move.
 
     Args:
         name: "ECM".

@@ -1,14 +1,15 @@
 """Client: a dVRK as its topics show it, and what is sent to it.
 
     client = Client(transport, ClientConfig(views=("front",)))
-    client.update()                      # take what has come
+    client.update()                      # take new messages
     client.age("/PSM1/measured_js")      # how old the newest is [s]
     client.send("/PSM1/servo_cp", pose)
-    client.step(["/PSM1/servo_cp"])      # only where the simulation's clock is ours
+    client.step(["/PSM1/servo_cp"])      # only if we set the simulation's clock
 
 The topics are a dVRK's (`robot.topics`); a `RenamedTransport` renames them where a robot's differ.
-What is sent has its own stamp. What is received is as old as its arrival here, since clocks differ,
-and by as much as its stamp lags behind the least late message of the last minutes.
+Messages that are sent have their own stamps. Since clocks differ, the age of a received message is
+the time since its arrival here, plus the lag of its stamp behind the least late message of the last
+minutes.
 """
 
 import math
@@ -27,28 +28,28 @@ from surgicai_vision.robot.topics import Topic
 from surgicai_vision.robot.transport import Inbox, Publish, Transport
 
 STEP_S = 10.0
-"""Time in which a served simulation must answer a request [s]; images may be slow to render."""
+"""Time within which a served simulation must answer a request [s]; rendering may be slow."""
 POLL_S = 0.005
 CONNECT_S = 20.0
-"""Time in which a robot must be found [s]."""
+"""Time within which a robot must be found [s]."""
 ASK_AGAIN_S = 0.5
 DRIFT = 1e-4
-"""How fast clocks may drift apart [s/s]; quartzes do by less than 1e-4."""
+"""How fast clocks may drift apart [s/s]; quartz clocks drift by less than 1e-4."""
 _DUE = (
     *("measured_js", "setpoint_js", "measured_cp", "setpoint_cp", "image_raw", "compressed"),
     "judgement",
 )
-"""Last part of the topics on which something comes all the time."""
+"""Last part of the names of topics that are published continually."""
 
 
 @dataclass(frozen=True)
 class ClientConfig:
-    """What a client hears.
+    """What a client subscribes to.
 
     Attributes:
-        arms: arms it hears and moves.
-        views: views whose images it hears.
-        is_compressed: hear the compressed images, not the raw ones.
+        arms: arms it listens to and moves.
+        views: views whose images it receives.
+        is_compressed: receive the compressed images instead of the raw ones.
         is_simulated: also use the topics that only a served simulation has.
     """
 
@@ -60,12 +61,12 @@ class ClientConfig:
 
 @dataclass(frozen=True)
 class Heard:
-    """A message that came.
+    """A message that was received.
 
     Attributes:
-        message: it.
+        message: the message.
         arrived: when it arrived here [s, monotonic].
-        lag: how much later than the least late ones of its topic [s].
+        lag: how much later it came than the least late ones of its topic [s].
     """
 
     message: Message
@@ -74,11 +75,11 @@ class Heard:
 
 
 class _Lag:
-    """How much later than usual the messages of one topic come.
+    """How much later than usual the messages of one topic arrive.
 
-    The sender's clock is another one: its stamps differ from arrivals by the difference of the
-    clocks and by the delay. The least difference there was is taken for no delay; it may rise by
-    `DRIFT`, as clocks drift.
+    The sender has a different clock: its stamps differ from arrivals by the difference of the
+    clocks and by the delay. The least difference so far counts as no delay; it may rise by `DRIFT`,
+    since clocks drift.
     """
 
     def __init__(self) -> None:
@@ -101,7 +102,7 @@ class Client:
 
     Args:
         transport: carries the messages.
-        config: what is heard.
+        config: what it subscribes to.
     """
 
     def __init__(self, transport: Transport, config: ClientConfig):
@@ -129,10 +130,10 @@ class Client:
         self._is_simulated = config.is_simulated
 
     def connect(self, seconds: float = CONNECT_S) -> None:
-        """Wait until somebody hears every topic that is said and says those that are due.
+        """Wait until all our topics have listeners and all continual ones have a message.
 
         Raises:
-            SurgicaiError: somebody or something is missing after so many seconds.
+            SurgicaiError: a listener, a message or an answer is missing after that many seconds.
         """
         ends = time.monotonic() + seconds
         asked = 0.0
@@ -158,7 +159,7 @@ class Client:
             self._transport.wait(POLL_S)
 
     def update(self) -> None:
-        """Take what has come; of a topic's messages the one with the latest stamp counts."""
+        """Take new messages; of a topic's messages, the one with the latest stamp counts."""
         for name, inbox in self._inboxes.items():
             for received in inbox():
                 before = self._newest.get(name)
@@ -168,7 +169,7 @@ class Client:
                     self._newest[name] = Heard(received.message, now, lag)
 
     def image_topic(self, view: str) -> str:
-        """Return the topic on which a view's images come."""
+        """Return the topic on which a view's images arrive."""
         return self._image_of(view).name
 
     def newest(self, topic: str) -> Heard | None:
@@ -190,7 +191,7 @@ class Client:
         self._publishers[topic](message)
 
     def wait(self, seconds: float) -> None:
-        """Wait until something comes, or so long."""
+        """Wait until a message comes, but no longer than `seconds`."""
         self._transport.wait(seconds)
 
     # -- a served simulation -----------------------------------------------------------------------
@@ -199,11 +200,11 @@ class Client:
         """Let a served simulation take one control step, and wait for all it publishes.
 
         Args:
-            sent: topics on which a message with `stamp` was sent, which must be heard first.
-            stamp: of them.
+            sent: topics on which a message with `stamp` was sent, which must be received first.
+            stamp: the stamp of those messages [ns].
 
         Returns:
-            The stamp of the states that followed; `update` has taken them.
+            The stamp of the states that followed, which `update` has already taken.
 
         Raises:
             SurgicaiError: no answer, or the step was not taken.
@@ -211,28 +212,28 @@ class Client:
         return self._ask(topics.STEP, " ".join(sent), stamp)
 
     def reset(self, seed: int) -> int:
-        """Begin an episode of a served simulation; as `step`."""
+        """Begin an episode of a served simulation; wait as `step` does."""
         return self._ask(topics.RESET, str(seed), self.stamp())
 
     def enter(self, subtask: str) -> int:
-        """Tell a served simulation's judge which subtask is on; as `step`."""
+        """Tell a served simulation's judge which subtask is active; wait as `step` does."""
         return self._ask(topics.ENTER, subtask, self.stamp())
 
     def tell_subtask(self, subtask: str) -> None:
-        """Tell a served simulation's judge which subtask is on, and do not wait."""
+        """Tell a served simulation's judge which subtask is active, without waiting."""
         self.send(topics.ENTER.name, StringStamped(Header(self.stamp()), subtask))
 
     def judgement(self) -> Mapping[str, JSON]:
         """Return how a served simulation judges the episode.
 
-        Nothing at a robot, and where what was heard is no judgement.
+        It is empty at a robot, and if what was received is not a judgement.
         """
         heard = self.newest(topics.JUDGEMENT.name)
         if heard is None or not isinstance(heard.message, StringStamped):
             return {}
         try:
             judged = parse_json(heard.message.text, topics.JUDGEMENT.name)
-        except BadFile:  # somebody else's, or torn on its way
+        except BadFile:  # another sender's, or damaged on the way
             return {}
         return judged if isinstance(judged, dict) else {}
 
@@ -241,7 +242,7 @@ class Client:
         asked = -math.inf
         ends = time.monotonic() + STEP_S
         while time.monotonic() < ends:
-            if time.monotonic() > asked + ASK_AGAIN_S:  # it may not have been heard yet
+            if time.monotonic() > asked + ASK_AGAIN_S:  # it may not have been received yet
                 asked = time.monotonic()
                 self.send(topic.name, request)
             self.update()
@@ -260,7 +261,7 @@ class Client:
         )
 
     def _is_answered(self, stamp: int) -> bool:
-        """Return True if a request was answered and all that was published with it has come."""
+        """Return True if a request was answered and all that was published with it has arrived."""
         heard = self.newest(topics.STEPPED.name)
         if heard is None or not isinstance(heard.message, StringStamped):
             return False
@@ -270,7 +271,7 @@ class Client:
         )
 
     def _wait_for(self, stamp: int, ends: float) -> None:
-        """Wait until everything that is sent anew all the time bears `stamp` at least."""
+        """Wait until every topic that is published continually has at least `stamp`."""
         while missing := [name for name in self._inboxes if not self._has(name, stamp)]:
             if time.monotonic() > ends:
                 raise SurgicaiError(f"Nothing new has come on {', '.join(missing)}.")
@@ -278,7 +279,7 @@ class Client:
             self.update()
 
     def _has(self, name: str, stamp: int) -> bool:
-        """Return True if a topic's newest message is of `stamp`, or nothing is due on it."""
+        """Return True if a topic's newest message is of `stamp` or later, or none is due on it."""
         if not self._is_due(name):
             return True
         heard = self._newest.get(name)
@@ -288,12 +289,12 @@ class Client:
 
     @staticmethod
     def _is_due(name: str) -> bool:
-        """Return True if something comes on a topic all the time."""
+        """Return True if a topic is published continually."""
         return name.rpartition("/")[2] in _DUE
 
 
 def _is_older(message: Message, than: Message) -> bool:
-    """Return True if a message was overtaken by another, as their stamps say."""
+    """Return True if a message was overtaken by another, according to their stamps."""
     if isinstance(message, String) or isinstance(than, String):
         return False
     return 0 < message.header.stamp < than.header.stamp

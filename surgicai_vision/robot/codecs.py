@@ -1,8 +1,8 @@
-"""Codecs: our messages as ROS messages and back, whatever Python types ROS's messages have.
+"""Codecs: our messages to ROS messages and back, whatever Python types the latter have.
 
 The fields are those of the message definitions of ROS's common_interfaces and of
-collaborative-robotics/crtk_msgs. Every ROS names them alike but for a stamp's parts and the
-matrices of a camera info; a `Dialect` says which types there are and where they differ.
+collaborative-robotics/crtk_msgs. All versions of ROS name them alike, except for the parts of a
+stamp and the matrices of a camera info. A `Dialect` holds the types and these differences.
 """
 
 from array import array
@@ -37,13 +37,13 @@ PARTS = (
     *(f"geometry_msgs/{part}" for part in ("Vector3", "Point", "Quaternion", "Pose", "Twist")),
     "sensor_msgs/RegionOfInterest",
 )
-"""Types that stand within those."""
+"""Types that are nested in those."""
 COLOURS = ("rgb8", "bgr8")
 EYE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Stamp(Protocol):
-    """A moment, as ROS 2 has it."""
+    """A stamp as in ROS 2."""
 
     sec: int
     nanosec: int
@@ -55,14 +55,14 @@ def _intrinsics(sample: "idl.CameraInfo") -> Sequence[float]:
 
 @dataclass(frozen=True)
 class Dialect:
-    """The Python types of one ROS, and what it names otherwise.
+    """The Python types of one ROS, and what it names differently.
 
     Attributes:
-        types: a type's name, "geometry_msgs/Point" → what makes one of its fields, by their names.
-        time: makes a stamp of nanoseconds.
+        types: a type's name, such as "geometry_msgs/Point" → what makes one from its named fields.
+        time: makes a stamp from nanoseconds.
         nanoseconds: reads a stamp.
-        data: makes what a field of bytes takes.
-        matrices: a camera info's names of the distortion, K, R and P.
+        data: converts bytes to what a bytes field takes.
+        matrices: a camera info's names for the distortion, K, R and P.
         intrinsics: reads K.
     """
 
@@ -75,7 +75,7 @@ class Dialect:
 
 
 def array_of(data: bytes) -> "array[int]":
-    """Return bytes as rclpy takes them without a look at each."""
+    """Return bytes in the form that rclpy accepts without checking each one."""
     return array("B", data)
 
 
@@ -106,11 +106,11 @@ class Codecs:
         )
 
     def encode(self, message: m.Message) -> object:
-        """Return the ROS message of one of ours."""
+        """Return the ROS message for one of ours."""
         return self._codecs[type(message)][0](message)
 
     def decode(self, kind: type[m.Message], sample: object) -> m.Message:
-        """Return our message of a ROS message.
+        """Return our message for a ROS message.
 
         Raises:
             InputError: an image that cannot be used.
@@ -219,10 +219,10 @@ class Codecs:
         )
 
     def _from_image(self, sample: "idl.Image") -> m.Image:
-        """Return an image of red, green, blue.
+        """Return an image in the order red, green, blue.
 
         Raises:
-            InputError: another encoding, or another size than announced.
+            InputError: an unknown encoding, or a size other than announced.
         """
         height = sample.height
         width = sample.width

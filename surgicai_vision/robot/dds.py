@@ -1,8 +1,8 @@
-"""DDS: the transport that ROS 2 nodes speak, by cyclonedds, with no ROS installed.
+"""DDS: the transport that ROS 2 nodes speak, through cyclonedds, with no ROS installed.
 
-Nothing but the named interface is heard or reached. Cyclone DDS sends on the interface it is told,
-but its receiving sockets are bound to every address of the machine; each is therefore bound to the
-device as well (Linux: SO_BINDTODEVICE), and where that is refused nothing is opened. On the
+Messages are sent and received on the named interface only. Cyclone DDS sends on the interface it is
+given, but its receiving sockets are bound to every address of the machine. Each is therefore bound
+to the device as well (Linux: SO_BINDTODEVICE); if that is refused, nothing is opened. On the
 loopback there is no multicast: participants find each other at 127.0.0.1, as those of ROS 2 do with
 `ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`.
 """
@@ -31,13 +31,13 @@ from surgicai_vision.robot.topics import DEPTHS, STAYING, Topic
 from surgicai_vision.robot.transport import LOOPBACK, Inbox, Publish, Received
 
 PARTICIPANTS = 60
-"""Processes on the loopback that are looked for; ROS 2's own default is 32."""
+"""Most processes that are looked for on the loopback; ROS 2's own default is 32."""
 BLOCKED_MS = 100
 """Time for which a writer waits for a slow reader [ms]; ROS 2's default."""
 
 
 def configuration(interface: str) -> str:
-    """Return Cyclone DDS's configuration that keeps to one interface."""
+    """Return the configuration that keeps Cyclone DDS to one interface."""
     is_loopback = interface == LOOPBACK
     discovery = (
         f"<ParticipantIndex>auto</ParticipantIndex>"
@@ -56,7 +56,7 @@ def configuration(interface: str) -> str:
 
 @final
 class CycloneTransport:
-    """Carries messages by Cyclone DDS; a context manager.
+    """Carries messages with Cyclone DDS; a context manager.
 
     Args:
         interface: name of the network interface.
@@ -99,7 +99,7 @@ class CycloneTransport:
         self._domain.__del__()
 
     def publisher(self, topic: Topic) -> Publish:
-        """Return what publishes messages on a topic."""
+        """Return a function that publishes messages on a topic."""
         writer = DataWriter(self._participant, self._topic(topic), qos=_quality(topic))
         self._writers[topic.name] = writer
 
@@ -109,7 +109,7 @@ class CycloneTransport:
         return publish
 
     def inbox(self, topic: Topic) -> Inbox:
-        """Return what takes the messages that have come on a topic; what cannot be read is left."""
+        """Return a function that takes a topic's new messages; it skips those it cannot read."""
         reader = DataReader(self._participant, self._topic(topic), qos=_quality(topic))
         condition = ReadCondition(reader, ViewState.Any | SampleState.NotRead | InstanceState.Alive)
         self._waiting.attach(condition)
@@ -128,20 +128,20 @@ class CycloneTransport:
                         source = f"{info.publication_handle:x}"
                         found.append(Received(message, source, info.source_timestamp))
                 except (InputError, ValueError, IndexError, struct.error):
-                    continue  # bytes that are no such message
+                    continue  # bytes that are not such a message
 
         return take
 
     def listeners(self, topic: Topic) -> int:
-        """Return how many hear what a publisher of this transport says on a topic."""
+        """Return the number of listeners to this transport's publisher on a topic."""
         return len(self._writers[topic.name].get_matched_subscriptions())
 
     def wait(self, seconds: float) -> None:
-        """Wait until a message comes, or so long."""
+        """Wait until a message comes, but no longer than `seconds`."""
         self._waiting.wait(max(0, int(seconds * 1e9)))
 
     def _topic(self, topic: Topic) -> DdsTopic[IdlStruct]:
-        """Return a topic under the name that ROS 2 gives it on the wire."""
+        """Return a topic with the name that ROS 2 gives it on the wire."""
         if topic.name not in self._topics:
             made = DdsTopic(self._participant, f"rt{topic.name}", TYPES[ROS_NAMES[topic.type]])
             self._topics[topic.name] = made

@@ -1,6 +1,6 @@
 """Dead-man's switch: what a person must hold for anything to be sent.
 
-Each says for how long it has not been seen held; `robot.guards.DEAD_MAN_S` is what that may be.
+Each reports the time since it was last seen held; `robot.guards.DEAD_MAN_S` is the limit.
 """
 
 import math
@@ -25,10 +25,10 @@ KEY = " "
 class HeldKey:
     """The space bar of this terminal; a context manager.
 
-    A terminal knows no releases: a held key repeats, and counts while it does.
+    A terminal reports no releases: a held key repeats, and counts as held while it does.
 
     Raises:
-        InputError: standard input is no terminal.
+        InputError: standard input is not a terminal.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class HeldKey:
         termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
 
     def age(self) -> float:
-        """Return for how long the key has not been seen held [s]."""
+        """Return the time since the key was last seen held [s]."""
         while select.select([self._descriptor], [], [], 0.0)[0]:
             text = os.read(self._descriptor, 64).decode("utf-8", "ignore")
             if not text:
@@ -63,11 +63,11 @@ class HeldKey:
 class HeldPedal:
     """A pedal or a gamepad's button: a `sensor_msgs/Joy` whose first button is 1.
 
-    It must be sent anew while it is held: of a sender that has died nobody knows what it held.
+    It must be sent repeatedly while held: a sender that has died cannot report a release.
 
     Args:
         transport: carries the messages.
-        topic: where they come.
+        topic: where they arrive.
     """
 
     def __init__(self, transport: Transport, topic: str):
@@ -75,7 +75,7 @@ class HeldPedal:
         self._seen = -math.inf
 
     def age(self) -> float:
-        """Return for how long the button has not been seen held [s]."""
+        """Return the time since the button was last seen held [s]."""
         for received in self._inbox():
             message = received.message
             if isinstance(message, Joy):

@@ -1,8 +1,8 @@
 """Driven robot: what an agent may ask of a dVRK, simulated or real, from its topics alone.
 
-Poses are those of the tip in the arm's base, as in the envs. Where a robot's own frames are others,
-`BagFrames` says so, as for `import-demos`: `psm1` and `psm2` are T_base_frame, the frame of the
-arm's `local/*` poses in our base of it; `tip` is T_tip_robot, the robot's tip frame in ours.
+Poses are those of the tip in the arm's base, as in the envs. If a robot's own frames differ,
+`BagFrames` gives them, as for `import-demos`: `psm1` and `psm2` are T_base_frame, the frame of the
+arm's `local/*` poses in our base of that arm; `tip` is T_tip_robot, the robot's tip frame in ours.
 """
 
 import math
@@ -36,7 +36,7 @@ from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import quaternion_to_matrix_flat
 
 RELEASED = names.PSM2.upper()
-"""The arm that lets go when the pull-out, which is the other one's, begins."""
+"""The arm that lets go when the other arm's pull-out begins."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class DrivenRobot:
     """What an agent may ask of a dVRK (`evaluation.agent.Robot`), from its topics.
 
     Args:
-        client: hears and sends.
+        client: receives and sends messages.
         views: views of the agent.
-        task: its task; the active arm follows.
-        size: height and width the agent sees [pixel].
-        frames: the robot's own frames, where they differ from ours.
-        jaw_scale: one finger's angle over the robot's jaw angle.
+        task: the agent's task, which determines the active arm.
+        size: height and width of the images that the agent sees [pixel].
+        frames: the robot's own frames, if they differ from ours.
+        jaw_scale: ratio of one finger's angle to the robot's jaw angle.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class DrivenRobot:
         self.release_steps = 0
 
     def on_enter(self, tell: Callable[[str], object]) -> None:
-        """Tell somebody which subtask is entered: the judge of a served simulation."""
+        """Set whom to tell which subtask is entered: the judge of a served simulation."""
         self._entered = tell
 
     def begin(self) -> None:
@@ -125,7 +125,7 @@ class DrivenRobot:
         return observation.setpoint(self.measured(self.active), jaw, told.pose, told.jaw)
 
     def enter(self, phase: int) -> None:
-        """Make a subtask the present one: its arm is active now."""
+        """Make a subtask the present one, and its arm the active one."""
         if not 0 <= phase < len(names.SUBTASKS):
             raise InputError(f"There is no subtask {phase}; allowed: 0 to 4.")
         if phase == self.phase:
@@ -153,7 +153,7 @@ class DrivenRobot:
     def frame(self, arm: str) -> tuple[str, Pose]:
         """Return the frame of an arm's `setpoint_cp` and our base in it, T_frame_base.
 
-        It follows from the same set point in the base and in the frame.
+        It is computed from the same set point in the base and in the frame.
         """
         outer = self._pose(f"/{arm}/setpoint_cp")
         inner = read_pose(self._pose(f"/{arm}/local/setpoint_cp"))
@@ -164,14 +164,14 @@ class DrivenRobot:
         """Return the base in a workspace's frame, T_frame_base.
 
         Raises:
-            InputError: the robot's own frame is another one.
+            InputError: the robot's own frame is a different one.
         """
         if frame == BASE:
             return poses.IDENTITY
         own, base = self.frame(arm)
         if own == frame:
             return base
-        if (own, frame) == (VIEW, WORLD):  # the simulation's world, where its endoscope stands
+        if (own, frame) == (VIEW, WORLD):  # the simulation's world, where its endoscope is fixed
             return poses.compose(T_WORLD_VIEW, base)
         raise InputError(f"{arm} speaks of '{own}'; the workspace's frame is '{frame}'.")
 
@@ -210,7 +210,7 @@ class DrivenRobot:
         return heard.message
 
     def _angle(self, topic: str) -> float:
-        """Return one finger's angle [rad] of a jaw's joint state."""
+        """Return one finger's angle [rad] from a jaw's joint state."""
         heard = self.client.newest(topic)
         assert heard is not None and isinstance(heard.message, JointState), "the guards asked"
         if len(heard.message.position) != 1 or not math.isfinite(heard.message.position[0]):
@@ -218,7 +218,7 @@ class DrivenRobot:
         return float(heard.message.position[0]) * self.jaw_scale
 
     def _ours(self, arm: str, pose: Pose) -> Pose:
-        """Return T_base_tip of a tip pose in the robot's own frames."""
+        """Return T_base_tip for a tip pose in the robot's own frames."""
         return poses.compose(self._frames[arm], poses.compose(pose, poses.invert(self.tip)))
 
     def _image(self, view: str) -> NDArray[np.uint8]:
@@ -252,7 +252,7 @@ def _decoded(message: CompressedImage) -> NDArray[np.uint8]:
 
 
 def _pose_of(values: tuple[float, ...]) -> Pose:
-    """Return the pose of x y z and a quaternion w x y z; () is none."""
+    """Return the pose from x y z and a quaternion w x y z; the identity for ()."""
     if not values:
         return poses.IDENTITY
     x, y, z, qw, qx, qy, qz = values

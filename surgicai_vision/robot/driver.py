@@ -1,13 +1,14 @@
-"""Driver: a policy at a dVRK, simulated or real, through its topics alone.
+"""Driver: lets a policy drive a dVRK, simulated or real, through its topics alone.
 
     robot = DrivenRobot(client, views, task, size)
     driver = Driver(agent, robot, task, config, dead_man, log, tell)
     driver.episode(seed, max_steps)
 
-Each control step the agent is given measured poses, jaws and images (`robot.driven`); what its
-action becomes, and whether it is sent, is `robot.setpoints`'. In real time a control step is drawn
-to begin just after images have come (`drawn_to_images`). Nothing else is done that the policy
-has not said, but PSM2's letting go where the pull-out begins.
+At each control step the agent gets measured poses, jaws and images (`robot.driven`).
+`robot.setpoints` turns its action into set points and decides whether they are sent. In real time,
+the beginning of a control step is pulled towards the moment just after images arrive
+(`drawn_to_images`). The only motion that the policy does not command is that of PSM2 when it lets
+go at the beginning of the pull-out.
 """
 
 import json
@@ -34,14 +35,14 @@ from surgicai_vision.robot.setpoints import Setpoints
 
 CONTROL_S = 1.0 / names.FPS
 AFTER_IMAGE_S = 0.002
-"""Time from an image's coming to the control step that sees it, once the two go together [s]."""
+"""Time from an image's arrival to the control step that sees it, once they are aligned [s]."""
 DRAWN_S = 0.002
-"""Time by which a control step begins earlier or later at most, to come after the images [s]."""
+"""Most by which a control step begins earlier or later, to come just after images [s]."""
 STOPS = (DISABLED, FAULT)
-"""States after which a run is over: somebody stopped the robot, and a person begins again."""
+"""States that end a run: the robot was stopped, and a person has to start it again."""
 
 TELL_AGAIN_S = 1.0
-"""Time after which the same reason for holding back is told again [s]; the log has every step."""
+"""Time until the same reason for holding back is reported again [s]; the log has every step."""
 _WITHOUT_NUMBERS = str.maketrans("", "", "0123456789.")
 
 
@@ -50,10 +51,10 @@ class DriveConfig:
     """How a robot is driven.
 
     Attributes:
-        guards: its limits.
-        sends: send what the policy says; else it is only told what would be sent.
-        is_simulated: a served simulation, which is reset and judges.
-        is_stepped: its clock is ours.
+        guards: the robot's limits.
+        sends: send what the policy commands; else only say what would be sent.
+        is_simulated: the robot is a served simulation, which is reset and judges.
+        is_stepped: we set the simulation's clock.
     """
 
     guards: GuardConfig
@@ -73,17 +74,17 @@ class DriveConfig:
 
 @dataclass(frozen=True)
 class DrivenEpisode:
-    """What became of an episode.
+    """The outcome of an episode.
 
     Attributes:
-        seed: of a served simulation's start.
+        seed: seed of a served simulation's start.
         steps: control steps in which something was sent or would have been.
         held: control steps in which the guards held everything back.
         success: as a served simulation judges it; None at a robot.
         progress: subtasks solved, likewise.
         ended: why it ended.
-        latencies: time from the newest pose to sending, each step [s].
-        image_latencies: time from the newest image to sending, likewise; none without images.
+        latencies: time from the newest pose to sending, for each step [s].
+        image_latencies: time from the newest image to sending, likewise; empty without images.
     """
 
     seed: int
@@ -103,14 +104,14 @@ class Driver:
     Args:
         agent: what acts.
         robot: the robot.
-        task: the agent's task: the step size of its actions.
-        config: how.
-        dead_man: returns for how long the dead-man's switch was last held [s].
-        log: gets one line of JSON a control step.
-        tell: told, in one line, what would be sent or why nothing is.
+        task: the agent's task, which gives the step size of its actions.
+        config: how the robot is driven.
+        dead_man: returns the time since the dead-man's switch was last held [s].
+        log: gets one line of JSON per control step.
+        tell: gets one line that says what would be sent, or why nothing is.
 
     Raises:
-        InputError: an agent that asks for more than a robot can say.
+        InputError: the agent needs more than a robot can tell.
     """
 
     def __init__(
@@ -149,8 +150,8 @@ class Driver:
         """Drive until the judge sees success, the robot is stopped, or the time is over.
 
         Args:
-            seed: of a served simulation's start, and of the agent's chance.
-            max_steps: control steps at most.
+            seed: seed of a served simulation's start, and of the agent's random numbers.
+            max_steps: maximum number of control steps.
         """
         robot = self._robot
         if self._config.is_simulated:
@@ -178,7 +179,7 @@ class Driver:
                     seen = robot.both_arms().tolist()
                     action = self._agent.act([0], [robot], [robot.observation()])[0]
                     commands, problem = self._setpoints.of_action(action, now)
-                except InputError as error:  # what has come cannot be used
+                except InputError as error:  # the input cannot be used
                     problem = str(error)
                 latencies.append(self._setpoints.youngest())
                 seen_at = self._setpoints.youngest_image()
@@ -212,7 +213,7 @@ class Driver:
         )
 
     def _check_judge(self) -> None:
-        """Refuse a served simulation that goes on to the next subtask in another way."""
+        """Refuse a served simulation that advances to the next subtask in a different way."""
         served = self._client.judgement().get("advance")
         if self._task.task == names.SUTURE and served != self._task.advance:
             raise InputError(
@@ -236,7 +237,7 @@ class Driver:
         return "the judge sees success" if judged.get("is_success") else ""
 
     def _sleep_until(self, due: float) -> None:
-        """Take what comes until the next control step is due."""
+        """Take messages until the next control step is due."""
         while (left := due - time.monotonic()) > 0.0:
             self._client.wait(left)
             self._client.update()
@@ -253,7 +254,7 @@ class Driver:
         problem: str,
         latency: float | None,
     ) -> None:
-        """Write one line of the log: what was measured, said, sent, or held back and why."""
+        """Write one line of the log: what was measured, commanded, sent, or held back and why."""
         line = {
             "time": time.time(),
             "episode": seed,
@@ -272,7 +273,7 @@ class Driver:
         self._log.write(json.dumps(line) + "\n")
 
     def _say(self, commands: Mapping[str, Command], problem: str) -> None:
-        """Tell why nothing is sent when that changes, and in a dry run what would be."""
+        """Say why nothing is sent when the reason changes, and in a dry run what would be sent."""
         kind = problem.translate(_WITHOUT_NUMBERS)
         now = time.monotonic()
         if kind != self._told:
@@ -294,18 +295,17 @@ class Driver:
 def drawn_to_images(after: float) -> float:
     """Return by how much a control step should begin earlier or later [s].
 
-    A policy that looks just after images have come acts a step sooner than one that looks just
-    before.
+    A policy that looks just after images arrive acts a step sooner than one that looks just before.
 
     Args:
-        after: time from some image's coming to the beginning of the step [s].
+        after: time from some image's arrival to the beginning of the step [s].
     """
     ahead = (after - AFTER_IMAGE_S + CONTROL_S / 2) % CONTROL_S - CONTROL_S / 2
     return min(max(-ahead, -DRAWN_S), DRAWN_S)
 
 
 def check_drivable(agent: Agent, task: TaskConfig) -> None:
-    """Refuse an agent that asks for more than a robot can say.
+    """Refuse an agent that needs more than a robot can tell.
 
     Raises:
         InputError: the agent reads a simulation's state or depth, or its env repeats actions.

@@ -1,6 +1,6 @@
-"""Frames: where the numbers of Cartesian messages are, and how poses become messages.
+"""Frames: the frames of Cartesian messages, and how poses become messages.
 
-* `world`: the scene's.
+* `world`: the scene's frame.
 * `PSM1_base`, `PSM2_base`: an arm's base, whose origin is its remote centre of motion.
 * `ECM`: the endoscope's optical frame, x forward, y left, z up.
 * `ECM_view`: what a surgeon sees: x left, y up, z forward, away from the viewer.
@@ -8,8 +8,8 @@
 Sources: docs/ros_crtk_contract.md of dvrk_simulator_base ("PSM Cartesian topics use the live
 `ECM_view` frame when an ECM is configured. PSM `local/*` poses remain in the static configured PSM
 base frame"), and for the axes its cartesian_frames.py. An empty frame means `ECM_view`
-(cartesian_command.py). The tip of a PSM is the wrist's yaw axis, as a dVRK's tool files 400006 and
-420006 have it.
+(cartesian_command.py). The tip of a PSM is the wrist's yaw axis, as in a dVRK's tool files 400006
+and 420006.
 """
 
 import math
@@ -31,9 +31,9 @@ from surgicai_vision.scene.rotations import (
 WORLD = "world"
 VIEW = "ECM_view"
 UNIT_TOLERANCE = 1e-3
-"""How far a quaternion's length may be from 1; it is then made 1."""
+"""How far a quaternion's length may be from 1; it is then normalised to 1."""
 STEP = 1e-5
-"""Time over which a velocity is the difference of two poses [s]; its error is of second order."""
+"""Half the time between the two poses that give a velocity [s]; its error is of second order."""
 
 
 T_VIEW_ECM: Pose = (0.0, 0.0, 0.0, *(0.0, 1.0, 0.0), *(0.0, 0.0, 1.0), *(1.0, 0.0, 0.0))
@@ -60,7 +60,7 @@ class Frames:
 
     @classmethod
     def of_psm(cls, name: str, base: Pose) -> "Frames":
-        """Return those of a PSM whose T_world_base is `base`."""
+        """Return the frames of a PSM whose T_world_base is `base`."""
         from_world = poses.invert(base)
         view = poses.compose(from_world, T_WORLD_VIEW)
         known = {"": view, VIEW: view, WORLD: from_world, base_frame(name): poses.IDENTITY}
@@ -70,7 +70,7 @@ class Frames:
         """Return a message's pose in the arm's base.
 
         Raises:
-            InputError: numbers that are not finite, no unit quaternion, or an unknown frame.
+            InputError: non-finite numbers, not a unit quaternion, or an unknown frame.
         """
         pose = read_pose(message)
         frame = message.header.frame
@@ -99,7 +99,7 @@ def read_pose(message: PoseStamped) -> Pose:
     """Return a message's pose in its own frame.
 
     Raises:
-        InputError: numbers that are not finite, or no unit quaternion.
+        InputError: non-finite numbers, or not a unit quaternion.
     """
     if len(message.position) != 3 or len(message.quaternion) != 4:
         raise InputError("A pose needs three numbers of position and four of orientation.")
@@ -121,7 +121,7 @@ def twist(
     Args:
         joints: six joints [rad, m].
         velocity: their velocities [rad/s, m/s].
-        instrument: of the PSM.
+        instrument: the PSM's instrument.
     """
 
     def tip(seconds: float) -> Pose:

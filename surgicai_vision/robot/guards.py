@@ -1,9 +1,10 @@
-"""Guards: what keeps a driven robot from harm, whatever a policy says.
+"""Guards: what keeps a driven robot from harm, whatever a policy outputs.
 
-Before every control step `problem_of_inputs` asks whether everything the policy is fed is there and
-fresh, and whether the arms may be moved; `problem_of_target` asks of what would be sent whether it
-is near enough to what was told and measured, and in the workspace. Where either answers, nothing is
-sent: a dVRK then stays at its last set point. There is no switch; limits are numbers of a file.
+Before every control step `problem_of_inputs` checks that all inputs of the policy are there and
+fresh, and that the arms may be moved. `problem_of_target` checks that a set point to be sent is
+near enough to the present one and the measured pose, and not too fast. If either finds a problem,
+nothing is sent: a dVRK then stays at its last set point. `is_outside` says whether a tip would
+leave the workspace. The guards cannot be switched off; limits are numbers in a file.
 """
 
 import math
@@ -24,7 +25,7 @@ from surgicai_vision.scene.kinematics import Pose
 BASE = "base"
 FRAMES = (WORLD, VIEW, BASE)
 ROOM = 1.01
-"""How far past the largest step of the policy's own preset a set point may be: rounding."""
+"""Factor by which a set point may exceed the largest step of the policy's preset: rounding."""
 SPEED_WINDOW_S = 0.5
 """Time over which the speed of set points is measured [s]."""
 DEAD_MAN_S = 0.5
@@ -38,12 +39,12 @@ class GuardConfig:
     Attributes:
         frame: whose axes the workspace is given in: "world" (the simulation's), "ECM_view", or
             "base", each arm's own.
-        low, high: corners of the box in which the tips may be told to be [m].
-        max_speed: of a tip's set point [m/s].
-        max_lead: distance of a set point from the measured tip [m].
-        max_lead_angle: angle between them [rad].
-        max_age: age of measured and told poses and jaws [s].
-        max_image_age: age of images [s].
+        low, high: corners of the box that contains all set points of the tips [m].
+        max_speed: largest speed of a tip's set point [m/s].
+        max_lead: largest distance of a set point from the measured tip [m].
+        max_lead_angle: largest angle between them [rad].
+        max_age: largest age of poses and jaws, measured and set points [s].
+        max_image_age: largest age of images [s].
     """
 
     frame: str = WORLD
@@ -75,7 +76,7 @@ class GuardConfig:
 
 @dataclass(frozen=True)
 class Input:
-    """Something a policy is fed: what it is called, how old it is, and how old it may be [s]."""
+    """An input of a policy: its name, how old it is, and how old it may be [s]."""
 
     name: str
     age: float
@@ -88,9 +89,9 @@ class Planned:
 
     Attributes:
         arm: "PSM1" or "PSM2".
-        told: where it is told to be now, T_base_tip.
+        told: its present set point, T_base_tip.
         measured: where it is, T_base_tip.
-        target: where it would be told to be, T_base_tip.
+        target: the set point that would be sent, T_base_tip.
         base: T_frame_base, the base in the workspace's frame.
     """
 
@@ -107,8 +108,8 @@ def problem_of_inputs(
     """Return why nothing may be sent now, or "".
 
     Args:
-        inputs: what the policy is fed.
-        states: arm → its operating state and whether it is homed; "" where none has come.
+        inputs: the policy's inputs.
+        states: arm → its operating state and whether it is homed; "" if none has arrived.
         dead_man_age: time since the dead-man's switch was last seen held [s].
     """
     if dead_man_age > DEAD_MAN_S:
@@ -131,7 +132,7 @@ class TargetGuard:
 
     Args:
         config: the limits.
-        step: the step size of the policy, which no set point may exceed.
+        step: the policy's step size, which no set point may exceed.
     """
 
     def __init__(self, config: GuardConfig, step: StepSize):
@@ -141,7 +142,7 @@ class TargetGuard:
         self._sent: dict[str, deque[tuple[float, Pose]]] = {}
 
     def is_outside(self, planned: Planned) -> bool:
-        """Return True if the tip would be told to leave the workspace."""
+        """Return True if a set point would take the tip out of the workspace."""
         tip = poses.transform(planned.base, poses.position(planned.target))
         sides = zip(self._config.low, tip, self._config.high, strict=True)
         return not all(low <= value <= high for low, value, high in sides)
@@ -182,9 +183,9 @@ class TargetGuard:
         self._sent.clear()
 
     def _speed(self, planned: Planned, now: float) -> float:
-        """Return the length of the set points' path over the window, divided by it [m/s].
+        """Return the length of the set points' path in the window, divided by the window [m/s].
 
-        A single step is judged by its own limit; a pause before it makes it no faster.
+        A single step has its own limit; here it counts as no faster after a pause.
         """
         way = 0.0
         last = planned.target

@@ -1,12 +1,12 @@
 """IDL: the ROS messages as DDS types.
 
-ROS 2 names a type `geometry_msgs/msg/PoseStamped` on the wire `geometry_msgs::msg::dds_::
-PoseStamped_` and a topic `/PSM1/servo_cp` `rt/PSM1/servo_cp` (design.ros2.org, "Topic and Service
-name mapping to DDS"). The fields are those of the message definitions of ROS 2's common_interfaces
-and of collaborative-robotics/crtk_msgs, in their order.
+On the wire, ROS 2 calls the type `geometry_msgs/msg/PoseStamped` `geometry_msgs::msg::dds_::
+PoseStamped_`, and the topic `/PSM1/servo_cp` `rt/PSM1/servo_cp` (design.ros2.org, "Topic and
+Service name mapping to DDS"). The fields are those of the message definitions of ROS 2's
+common_interfaces and of collaborative-robotics/crtk_msgs, in the same order.
 
-Bytes of images would be taken apart one by one by the general serialiser (6 ms an image); here they
-are copied as they are, in CDR's own form: a count of four bytes, then the bytes.
+The general serialiser would handle the bytes of an image one by one (6 ms per image). Here they are
+copied as they are, in CDR's own form: a count of four bytes, then the bytes.
 """
 
 import struct
@@ -23,7 +23,7 @@ from surgicai_vision.robot.codecs import Codecs, Dialect
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    # What a field holds; the types of the IDL say how it is written.
+    # What a field holds in Python; the IDL's types below say how it is written.
     float64 = float
     int32 = int
     uint8 = int
@@ -199,13 +199,13 @@ class CameraInfo(IdlStruct, typename="sensor_msgs::msg::dds_::CameraInfo_"):
 
 
 class _EndsInBytes(Protocol):
-    """A type whose last field is many bytes."""
+    """A type whose last field is a long sequence of bytes."""
 
     data: Bytes
 
 
 def _write_bytes[S: _EndsInBytes](sample: S, version_2: bool | None) -> bytes:
-    """Return the CDR of a sample's other fields, then its bytes as they are."""
+    """Return the CDR of a sample's other fields, followed by its bytes as they are."""
     data = bytes(sample.data)
     sample.data = b""
     head = IdlStruct.serialize(cast(IdlStruct, sample), use_version_2=version_2)
@@ -216,19 +216,19 @@ def _write_bytes[S: _EndsInBytes](sample: S, version_2: bool | None) -> bytes:
 def _read_bytes[S: _EndsInBytes](
     kind: type[S], fields: str, data: bytes, has_header: bool, version_2: bool | None
 ) -> S:
-    """Return the sample of a CDR whose last field is many bytes.
+    """Return the sample of a CDR whose last field is a long sequence of bytes.
 
     Args:
-        kind: its type.
+        kind: the sample's type.
         fields: what lies between the header and the bytes: "u" of 4 bytes, "b" of 1, "s" a text.
         data: the CDR.
-        has_header: as Cyclone DDS asks.
+        has_header: as Cyclone DDS passes it.
         version_2: likewise.
     """
     found = _bytes_at(data, fields)
     empty = data[: found.start - 4] + bytes(4)
     idl = cast(type[IdlStruct], kind).__idl__
-    versions = cast(bool, version_2)  # None is Cyclone DDS's own default, and not in its type
+    versions = cast(bool, version_2)  # None is Cyclone DDS's own default, but not in its type
     sample = cast(S, idl.deserialize(empty, has_header=has_header, use_version_2=versions))
     sample.data = bytes(data[found])
     return sample
@@ -238,11 +238,11 @@ def _bytes_at(data: bytes, fields: str) -> slice:
     """Return where the last field's bytes lie in a little-endian CDR that begins with a header.
 
     Args:
-        data: four bytes of encapsulation, then the CDR, whose alignments count from there.
+        data: four bytes of encapsulation, then the CDR, from which alignment counts.
         fields: what lies between the header and the bytes.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not one.
     """
     if data[:2] not in (b"\x00\x01", b"\x00\x07"):  # CDR or XCDR2, little-endian
         raise InputError("an image came in an encoding other than little-endian CDR.")
@@ -324,5 +324,5 @@ TYPES: Mapping[str, type[IdlStruct]] = MappingProxyType(
         )
     }
 )
-"""A type's name, as ROS has it → the type."""
+"""A type's name in ROS → the type."""
 CODECS = Codecs(Dialect(TYPES, _time, lambda stamp: stamp.sec * SECOND + stamp.nanosec))

@@ -1,10 +1,10 @@
-"""Images: what the cameras of a served simulation publish, without holding up its control.
+"""Images: what the cameras of a served simulation publish, without delaying its control.
 
-In real time images are rendered in a thread with an env of its own. A control step is computed at
-its beginning, so the state that it leads to is offered to the thread ahead of its time, and its
-images are published as soon as it is the present one. When rendering is slower than the rate,
-states are left out, and control goes on. Where the client sets the clock they are rendered at once,
-each step. An image bears the stamp of the state it shows. A view that nobody hears is not rendered.
+In real time, images are rendered in a thread with its own env. A control step is computed at its
+beginning, so the resulting state is offered to the thread ahead of time. Its images are published
+as soon as it is the present state. If rendering is slower than the rate, states are skipped and
+control continues. If the client sets the clock, images are rendered immediately at each step. An
+image has the stamp of the state it shows. A view without a listener is not rendered.
 """
 
 import io
@@ -39,9 +39,9 @@ class Shot:
 
     Attributes:
         view: the camera or crop.
-        intrinsics: its matrix, row by row [pixel].
-        raw: the image's bytes, height × width × 3; None where nobody hears it.
-        jpeg: the image as a JPEG file; None where nobody hears that.
+        intrinsics: its camera matrix, row by row [pixel].
+        raw: the image's bytes, height × width × 3; None without a listener.
+        jpeg: the image as a JPEG file; None without a listener.
     """
 
     view: str
@@ -52,7 +52,7 @@ class Shot:
 
 @dataclass
 class _Offer:
-    """A state to be shown, and the stamp it bears once it is the present one [ns]."""
+    """A state to be shown, and its stamp once it is the present one [ns]."""
 
     state: State
     stamp: int | None = None
@@ -66,9 +66,9 @@ class Cameras:
         env: the env.
         views: its cameras and crops.
         size: height and width of an image [pixel].
-        is_compressed: publish JPEG files besides.
-        publisher: returns what publishes on a topic.
-        is_heard: returns whether somebody hears a topic.
+        is_compressed: also publish JPEG files.
+        publisher: returns a function that publishes on a topic.
+        is_heard: returns whether a topic has a listener.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class ImageThread:
             return self._next is None
 
     def offer(self, state: State) -> None:
-        """Render a state of the env's `get_state` next, in the place of one that still waits.
+        """Render a state from the env's `get_state` next, instead of one that is still waiting.
 
         Raises:
             Exception: whatever ended the thread.
@@ -173,9 +173,9 @@ class ImageThread:
             self._changed.notify()
 
     def release(self, stamp: int) -> None:
-        """Publish the state that was offered last, now that it is the present one of `stamp` [ns].
+        """Publish the state that was offered last, now the present one, with `stamp` [ns].
 
-        Nothing is done where it was released before.
+        Nothing is done if it was released before.
         """
         with self._changed:
             if self._newest is not None and self._newest.stamp is None:
@@ -185,7 +185,7 @@ class ImageThread:
     def _run(self) -> None:
         try:
             self._render()
-        except Exception as error:  # it belongs to the thread that offers states
+        except Exception as error:  # the thread that offers states raises it
             with self._changed:
                 self._error = error
                 self._next = None
@@ -202,14 +202,14 @@ class ImageThread:
         env.close()
 
     def _take(self) -> _Offer | None:
-        """Wait for an offer and take it; None where the thread is over."""
+        """Wait for an offer and take it; None if the thread is over."""
         with self._changed:
             self._changed.wait_for(lambda: self._next is not None or self._is_over)
             offer, self._next = self._next, None
             return None if self._is_over else offer
 
     def _stamp_of(self, offer: _Offer) -> int | None:
-        """Wait for an offer's stamp; None at the end, or where a reset put another in its place."""
+        """Wait for an offer's stamp; None at the end, or if a reset replaced the offer."""
         with self._changed:
             self._changed.wait_for(
                 lambda: offer.stamp is not None or offer is not self._newest or self._is_over

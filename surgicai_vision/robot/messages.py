@@ -1,9 +1,9 @@
-"""Messages: what travels, as plain data, whatever carries it.
+"""Messages: what is sent, as plain data, whatever transport carries it.
 
-Each is the ROS message of its name with the same content; the fields of CRTK's are those of
-collaborative-robotics/crtk_msgs (OperatingState.msg, StringStamped.msg). Units are ROS's: m, rad,
-m/s, rad/s; quaternions are x y z w. A stamp is whole nanoseconds since the epoch, and 0 says that
-the sender gave none.
+Each has the content of the ROS message with the same name; the fields of CRTK's messages are those
+of collaborative-robotics/crtk_msgs (OperatingState.msg, StringStamped.msg). Units are ROS's: m,
+rad, m/s, rad/s; quaternions are x y z w. A stamp is in whole nanoseconds since the epoch; 0 means
+that the sender gave none.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Header:
-    """When something was so, and in which frame its numbers are."""
+    """The time of a message's content, and the frame of its numbers."""
 
     stamp: int = 0
     frame: str = ""
@@ -21,7 +21,7 @@ class Header:
 
 @dataclass(frozen=True)
 class JointState:
-    """sensor_msgs/JointState: names, positions, velocities and efforts of joints; () is none."""
+    """sensor_msgs/JointState: names, positions, velocities and efforts of joints; () if absent."""
 
     header: Header
     names: tuple[str, ...]
@@ -41,7 +41,7 @@ class PoseStamped:
 
 @dataclass(frozen=True)
 class TwistStamped:
-    """geometry_msgs/TwistStamped: a linear and an angular velocity, x y z each."""
+    """geometry_msgs/TwistStamped: a linear and an angular velocity, each x y z."""
 
     header: Header
     linear: Numbers

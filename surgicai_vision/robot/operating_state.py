@@ -1,10 +1,10 @@
-"""OperatingState: whether an arm obeys, as CRTK has it.
+"""OperatingState: whether an arm obeys, as in CRTK.
 
     DISABLED ──enable──► ENABLED ◄──resume── PAUSED ◄──pause── ENABLED
     any ──disable──► DISABLED      any ──fault──► FAULT ──clear_fault──► DISABLED
 
-States and commands are CRTK's; which command is allowed where follows
-dvrk_simulator_base/operating_state.py. An arm moves in ENABLED alone, and only when it is homed.
+States and commands are CRTK's; which command is allowed in which state follows
+dvrk_simulator_base/operating_state.py. An arm moves only in ENABLED, and only when it is homed.
 """
 
 from surgicai_vision.core.errors import InputError, UnknownName
@@ -51,10 +51,10 @@ class OperatingStates:
         return self.state == ENABLED and self.is_homed
 
     def command(self, text: str) -> None:
-        """Obey a `state_command`, in any case.
+        """Obey a `state_command`, in upper or lower case.
 
         Raises:
-            InputError: no such command, or not in the present state.
+            InputError: no such command, or not allowed in the present state.
         """
         word = text.strip().lower()
         if word in _HOMINGS:

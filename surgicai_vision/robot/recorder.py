@@ -1,9 +1,9 @@
-"""Recorder: what a client does to a served simulation becomes demonstrations.
+"""Recorder: turns what a client does to a served simulation into demonstrations.
 
-From a reset to the judge's success, an episode is whole states and actions like any other
-(`demos.store`), which `render-demos` takes. An action is the move of the active arm's set point
-within a control step, in units of the step preset; what a client told beyond that is clipped, and
-counted. What is done to the other arm is in the states.
+An episode lasts from a reset to the judge's success. It has whole states and actions like any other
+(`demos.store`), and `render-demos` accepts it. An action is the motion of the active arm's set
+point within a control step, in units of the step preset. What a client commands beyond that is
+clipped, and these steps are counted. What is done to the other arm is in the states only.
 """
 
 import math
@@ -27,9 +27,9 @@ ROUNDING = 1e-6
 
 
 def action_between(before: Command, after: Command, step: StepSize) -> NDArray[np.float64]:
-    """Return the action (7,) that moves one command of an arm to another (`control.follow`).
+    """Return the action (7,) that takes an arm from one command to another (`control.follow`).
 
-    It is not clipped: beyond 1 no action of the preset does it in one step.
+    It is not clipped: beyond 1 no action of the preset does this in one step.
     """
     turn = multiply_flat(poses.rotation(after.pose), transpose_flat(poses.rotation(before.pose)))
     shift = np.subtract(poses.position(after.pose), poses.position(before.pose))
@@ -49,7 +49,7 @@ class Recorder:
     Args:
         robot: the simulation.
         recordings: the folder that keeps those that succeed.
-        tell: told what became of an episode.
+        tell: gets the outcome of an episode as text.
     """
 
     def __init__(self, robot: SimulatedRobot, recordings: Recordings, tell: Callable[[str], None]):
@@ -61,7 +61,7 @@ class Recorder:
         self.begin()
 
     def begin(self) -> None:
-        """Begin an episode: the robot has been reset. What was not kept is dropped."""
+        """Begin an episode, after a reset of the robot; a previous one not kept is dropped."""
         self._is_on = True
         self._clipped = 0
         self._states = [self._robot.env.get_state()]
@@ -72,14 +72,14 @@ class Recorder:
         self._contacts: list[bool] = []
 
     def before_step(self) -> None:
-        """Remember where the active arm is told to be."""
+        """Remember the active arm's set point."""
         env = self._robot.env
         self._phase = env.phase
         self._arm = env.subtask.arm
         self._told = env.simulation.within_reach(self._arm)
 
     def after_step(self) -> None:
-        """Record the step, and keep the episode where it succeeded."""
+        """Record the step, and keep the episode if it succeeded."""
         if not self._is_on:
             return
         env = self._robot.env

@@ -1,13 +1,13 @@
-"""ROS 1: the transport by rospy, where ROS 1 itself is installed and a master runs.
+"""ROS 1: the transport through rospy, if ROS 1 itself is installed and a master runs.
 
     ROS_MASTER_URI=http://127.0.0.1:11311 surgicai-vision robot serve --transport rospy
 
-rospy calls back in threads of its own; what comes is kept until it is taken. `crtk_msgs` need not
-be installed: where it cannot be imported, its types are made of their definitions, and have the
-same MD5 sums. ROS 1 knows no domains: masters keep systems apart.
+rospy calls back in its own threads; messages are kept until they are taken. `crtk_msgs` need not be
+installed: if it cannot be imported, its types are made from their definitions, and have the same
+MD5 sums. ROS 1 has no domains: masters separate systems.
 
-On the loopback all of rospy's sockets are bound to 127.0.0.1. On another interface rospy tells
-others this machine's address there, and listens on every address of the machine.
+On the loopback all of rospy's sockets are bound to 127.0.0.1. On another interface, rospy tells
+others this machine's address there, but listens on every address of the machine.
 """
 
 import fcntl
@@ -46,25 +46,25 @@ DEFINITIONS = {
 }
 """Type → its definition (collaborative-robotics/crtk_msgs, msg/)."""
 SIOCGIFADDR = 0x8915
-"""Asks an interface for its address (linux/sockios.h)."""
+"""The ioctl request for an interface's address (linux/sockios.h)."""
 WAITING = 64
-"""Messages of a topic that wait to be taken at most; the oldest is left out."""
+"""Most messages of a topic that wait to be taken; beyond that the oldest is dropped."""
 
 
 class _Stamp(Protocol):
-    """A moment, as ROS 1 has it."""
+    """A stamp as in ROS 1."""
 
     def to_nsec(self) -> int: ...
 
 
 class _Info(Protocol):
-    """A camera info, as ROS 1 has it."""
+    """A camera info as in ROS 1."""
 
     K: Sequence[float]
 
 
 def dialect() -> Dialect:
-    """Return ROS 1's message types as this Python has them.
+    """Return ROS 1's message types as installed for this Python.
 
     Raises:
         ImportError: a package of messages is missing.
@@ -93,14 +93,14 @@ def dialect() -> Dialect:
 
 @final
 class RospyTransport:
-    """Carries messages by rospy; a context manager.
+    """Carries messages with rospy; a context manager.
 
     Args:
         interface: name of the network interface.
-        domain: 0; ROS 1 has none.
+        domain: must be 0; ROS 1 has none.
 
     Raises:
-        InputError: no such interface, a domain, no master, or rospy ran in this process before.
+        InputError: no such interface, a domain, no master, or rospy already ran in this process.
         ImportError: a package of messages is missing.
     """
 
@@ -137,7 +137,7 @@ class RospyTransport:
         rospy.signal_shutdown("closed")
 
     def publisher(self, topic: Topic) -> Publish:
-        """Return what publishes messages on a topic."""
+        """Return a function that publishes messages on a topic."""
         made = rospy.Publisher(
             topic.name,
             self._type(topic),
@@ -154,7 +154,7 @@ class RospyTransport:
         return publish
 
     def inbox(self, topic: Topic) -> Inbox:
-        """Return what takes the messages that have come on a topic; what cannot be read is left."""
+        """Return a function that takes a topic's new messages; it skips those it cannot read."""
         waiting: deque[tuple[object, str, int]] = deque(maxlen=WAITING)
 
         def keep(sample: object) -> None:
@@ -179,11 +179,11 @@ class RospyTransport:
         return take
 
     def listeners(self, topic: Topic) -> int:
-        """Return how many hear what a publisher of this transport says on a topic."""
+        """Return the number of listeners to this transport's publisher on a topic."""
         return self._publishers[topic.name]()
 
     def wait(self, seconds: float) -> None:
-        """Wait until a message comes, or so long."""
+        """Wait until a message comes, but no longer than `seconds`."""
         self._came.wait(max(0.0, seconds))
         self._came.clear()
 
@@ -201,7 +201,7 @@ def _address(interface: str) -> str:
     """Return the address of an interface.
 
     Raises:
-        InputError: it has none.
+        InputError: it has no address.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         try:

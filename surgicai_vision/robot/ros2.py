@@ -1,12 +1,12 @@
-"""ROS 2: the transport by rclpy, where ROS 2 itself is installed.
+"""ROS 2: the transport through rclpy, if ROS 2 itself is installed.
 
 Messages are taken from the subscriptions as `rclpy.wait_for_message` takes them: without an
-executor, whose wait set is built anew for every message. What is sent and heard keeps to one
-interface, as by Cyclone DDS (`robot.sockets`); on the loopback nodes find each other as
-`ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST` has it, in shared memory too.
+executor, which would rebuild its wait set for every message. Messages are sent and received on one
+interface only, as with Cyclone DDS (`robot.sockets`). On the loopback, nodes find each other as
+with `ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`, also through shared memory.
 
-rclpy does not tell who sent a message, only its number among those of its sender. `Senders` tells
-two senders apart by that; where a middleware gives no numbers, all are one.
+rclpy does not report who sent a message, only its number among those of its sender. `Senders`
+distinguishes two senders by these numbers; if a middleware gives none, all senders count as one.
 """
 
 import importlib
@@ -35,7 +35,7 @@ LOCALHOST = "LOCALHOST"
 
 
 class _Subscription(Protocol):
-    """What is used of rclpy's subscription."""
+    """The part of rclpy's subscription that is used."""
 
     handle: "_Handle"
     msg_type: type
@@ -51,7 +51,7 @@ class _Handle(Protocol):
 
 
 def dialect() -> Dialect:
-    """Return ROS 2's message types as this Python has them.
+    """Return ROS 2's message types as installed for this Python.
 
     Raises:
         ImportError: a package of messages is missing.
@@ -74,7 +74,7 @@ def dialect() -> Dialect:
 
 @final
 class RclpyTransport:
-    """Carries messages by rclpy; a context manager.
+    """Carries messages with rclpy; a context manager.
 
     Args:
         interface: name of the network interface.
@@ -127,7 +127,7 @@ class RclpyTransport:
         rclpy.try_shutdown(context=self._context)
 
     def publisher(self, topic: Topic) -> Publish:
-        """Return what publishes messages on a topic."""
+        """Return a function that publishes messages on a topic."""
         made = self._node.create_publisher(self._type(topic), topic.name, _quality(topic))
         self._publishers[topic.name] = made.get_subscription_count
 
@@ -137,7 +137,7 @@ class RclpyTransport:
         return publish
 
     def inbox(self, topic: Topic) -> Inbox:
-        """Return what takes the messages that have come on a topic; what cannot be read is left."""
+        """Return a function that takes a topic's new messages; it skips those it cannot read."""
         made = cast(
             _Subscription,
             self._node.create_subscription(
@@ -163,11 +163,11 @@ class RclpyTransport:
         return take
 
     def listeners(self, topic: Topic) -> int:
-        """Return how many hear what a publisher of this transport says on a topic."""
+        """Return the number of listeners to this transport's publisher on a topic."""
         return self._publishers[topic.name]()
 
     def wait(self, seconds: float) -> None:
-        """Wait until a message comes, or so long."""
+        """Wait until a message comes, but no longer than `seconds`."""
         count = len(self._subscriptions)
         waiting = rclpy_implementation.WaitSet(count, 0, 0, 0, 0, 0, self._context.handle)
         waiting.clear_entities()

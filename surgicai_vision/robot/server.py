@@ -3,12 +3,12 @@
     with open_transport("cyclonedds") as transport, Server(robot, transport, config) as server:
         server.run(lambda: False)
 
-In real time a control step of 20 ms begins 50 times a second: the commands that have come become
-the set points, the state at its beginning is published with them and the images of that state, and
-the state halfway is published 10 ms later, so that states come 100 times a second. A set point that
-came in time is thus published before its sender's next control step begins. Where the client sets
-the clock (`stepped`), nothing moves until a message on `/simulation/step` asks for it; everything
-published for a step bears one stamp, and `/simulation/stepped` says which, last.
+In real time, a control step of 20 ms begins 50 times a second. The commands that have arrived
+become the set points; they are published with the state at the beginning of the step and the images
+of that state. The state halfway is published 10 ms later, so that states come 100 times a second. A
+set point that arrived in time is thus published before its sender's next control step begins. If
+the client sets the clock (`stepped`), nothing moves until a message on `/simulation/step` requests
+it. Everything published for a step has the same stamp, which `/simulation/stepped` reports last.
 """
 
 import json
@@ -66,11 +66,11 @@ CONTROL_S = 1.0 / names.FPS
 PATIENCE_S = 1.0
 """Time for which a step waits for the commands it names [s]."""
 MAX_BEHIND_S = 0.1
-"""Time by which the clock may lag before it is set anew [s]; nothing is caught up in a burst."""
+"""Time by which the clock may lag before it is reset [s]; nothing is caught up in a burst."""
 
 
 REMEMBERED = 64
-"""Requests that are known again when they come twice; a client asks anew if no answer comes."""
+"""Requests that are recognised when they come twice; a client repeats one without an answer."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,9 @@ class ServeConfig:
         clock: "real", or "stepped" by the client.
         views: cameras and crops it publishes.
         size: height and width of their images [pixel].
-        image_rate: images of each view a second at most, in real time [Hz].
-        is_compressed: publish JPEG files besides raw images.
-        shows_truth: publish the needle's pose and the subtask under way, which no robot knows.
+        image_rate: most images of each view per second, in real time [Hz].
+        is_compressed: publish JPEG files in addition to raw images.
+        shows_truth: publish the needle's pose and the active subtask, which no robot knows.
     """
 
     clock: str = REAL
@@ -99,12 +99,12 @@ class ServeConfig:
 
 @dataclass(frozen=True)
 class _Request:
-    """A message that asks the simulation for something, and what must come before it.
+    """A message that requests something from the simulation.
 
     Attributes:
-        stamp: of its header [ns].
-        text: what is asked.
-        asked: when it came, by the monotonic clock [s].
+        stamp: stamp of its header [ns].
+        text: what is requested; for a step, the topics whose messages must come first.
+        asked: when it arrived, by the monotonic clock [s].
         sent: when it was sent, as `Received.sent`.
     """
 
@@ -195,7 +195,7 @@ class Server:
         self._stack.close()
 
     def run(self, is_over: Callable[[], bool]) -> None:
-        """Serve until `is_over` returns True; it is asked once a control step."""
+        """Serve until `is_over` returns True; it is called once per control step."""
         if self.config.clock == STEPPED:
             while not is_over():
                 self._transport.wait(CONTROL_S)
@@ -232,7 +232,7 @@ class Server:
     # -- what comes --------------------------------------------------------------------------------
 
     def poll(self) -> None:
-        """Take what has come; where the client sets the clock, also step as it asks."""
+        """Take new messages; if the client sets the clock, also step as requested."""
         for request in self._texts(self._resets):
             self._do(request, lambda text: self._reset(_seed(text)))
             self._reset_sent = max(self._reset_sent, request.sent)
@@ -243,7 +243,7 @@ class Server:
             (received.sent, place, received)
             for place, (_, _, _, inbox) in enumerate(self._inboxes)
             for received in inbox()
-            if received.sent >= self._reset_sent  # not what was meant for the episode before
+            if received.sent >= self._reset_sent  # not what was meant for the previous episode
         ]
         for _, place, received in sorted(heard, key=lambda entry: entry[:2]):
             arm, channel, topic, _ = self._inboxes[place]
@@ -257,7 +257,7 @@ class Server:
             self._requests.clear()
 
     def _hear(self, arm: Arm, channel: str, topic: str, received: Received) -> None:
-        """Hand a command to its arm, and say so where it is refused."""
+        """Pass a command to its arm, and say so if it is refused."""
         try:
             arm.receive(channel, received.message, received.source, time.time_ns())
         except InputError as error:
@@ -265,7 +265,7 @@ class Server:
         self._stamps[topic] = max(self._stamps.get(topic, 0), _stamp_of(received.message))
 
     def _texts(self, inbox: Inbox) -> list[_Request]:
-        """Return the requests that have come, each with a stamp once."""
+        """Return the new requests; those with a stamp only once."""
         found: list[_Request] = []
         for received in inbox():
             message = received.message
@@ -278,7 +278,7 @@ class Server:
         return found
 
     def _do(self, request: _Request, act: Callable[[str], None]) -> None:
-        """Do what a request asks and answer it."""
+        """Do what a request says and answer it."""
         try:
             act(request.text)
         except InputError as error:
@@ -296,7 +296,7 @@ class Server:
         self._publishers[topics.STEPPED.name](StringStamped(Header(stamp), text))
 
     def _step_as_asked(self, request: _Request) -> bool:
-        """Take the step that is asked for; return False while commands it names are missing."""
+        """Take the requested step; return False while commands that it names are missing."""
         missing = [
             topic for topic in request.text.split() if self._stamps.get(topic, 0) < request.stamp
         ]
@@ -313,7 +313,7 @@ class Server:
     # -- what moves --------------------------------------------------------------------------------
 
     def _obey(self) -> None:
-        """Let the arms obey: what they are told becomes their set points."""
+        """Let the arms obey: the commands become their set points."""
         seconds = self.robot.steps * CONTROL_S
         targets: dict[str, Target] = {}
         for name, psm in self._psms.items():
@@ -335,13 +335,13 @@ class Server:
                     psm.stop("the physics diverged; ask for a reset")
 
     def _reset(self, seed: int) -> None:
-        """Begin another episode; arms that may move go on obeying, without what they were told."""
+        """Begin another episode; arms that may move still obey, but forget earlier commands."""
         self.robot.reset(seed)
         if self._recorder is not None:
             self._recorder.begin()
         for psm in self._psms.values():
             psm.forget()
-        if self._images is not None:  # in the place of what the episode before was coming to
+        if self._images is not None:  # instead of the previous episode's next state
             self._images.offer(self.robot.env.get_state())
 
     # -- what is said ------------------------------------------------------------------------------
@@ -365,7 +365,7 @@ class Server:
         self._publish_judgement(stamp)
 
     def _publish_states(self, states: dict[str, ArmState], stamp: int) -> None:
-        """Publish what the PSMs measure and are told."""
+        """Publish the measured states and set points of the PSMs."""
         for name, state in states.items():
             self._publish_joints(name, "measured", state.joints, state.velocity, stamp)
             self._publish_joints(name, "setpoint", state.setpoint, (), stamp)
@@ -383,7 +383,7 @@ class Server:
     def _publish_joints(
         self, name: str, kind: str, joints: Joints, velocity: tuple[float, ...], stamp: int
     ) -> None:
-        """Publish joints and the tip's pose that they give, in the view and in the base."""
+        """Publish joints and the resulting tip pose, in the view and in the base."""
         header = Header(stamp, VIEW)
         publish = self._publishers
         publish[f"/{name}/{kind}_js"](JointState(header, JOINT_NAMES, joints, velocity))
@@ -399,7 +399,7 @@ class Server:
         self._publishers[f"/{name}/jaw/{kind}_js"](jaw)
 
     def _publish_operating(self, arm: Arm, stamp: int) -> None:
-        """Publish an arm's operating state where it has changed, and what it has to say."""
+        """Publish an arm's operating state if it has changed, and its notes."""
         now = (arm.operating.state, arm.operating.is_homed, arm.is_busy)
         header = Header(stamp, WORLD if arm is self._ecm else VIEW)
         if self._shown.get(arm.name) != now:
@@ -416,7 +416,7 @@ class Server:
         self._publishers[f"/{name}/{level}"](StringStamped(header, text))
 
     def _publish_judgement(self, stamp: int) -> None:
-        """Publish how the episode stands."""
+        """Publish the judged state of the episode."""
         info = self.robot.info
         env = self.robot.env
         judged = {
@@ -432,7 +432,7 @@ class Server:
         self._publishers[topics.JUDGEMENT.name](message)
 
     def _offer_image(self) -> None:
-        """Give the image thread the state to come, where an image of it is due and it has time."""
+        """Give the image thread the coming state, if an image is due and the thread is free."""
         images = self._images
         now = time.monotonic()
         if images is None or now < self._next_image or not images.is_free:
@@ -466,7 +466,7 @@ def _stamp_of(message: Message) -> int:
 
 
 def _seed(text: str) -> int:
-    """Return the seed that a reset asks for."""
+    """Return the seed that a reset requests."""
     if not text.isdecimal():
         raise InputError(f"a reset's text must be a seed, a whole number; it is '{text[:40]}'.")
     return int(text)

@@ -1,17 +1,17 @@
-"""Set points: what an action becomes, whether the guards let it through, and its sending.
+"""Set points: turns an action into set points, lets the guards check them, and sends them.
 
     problem = setpoints.problem_of_inputs()
     commands, problem = setpoints.of_action(action, now)
     setpoints.send({} if problem else commands)
 
-An action is added to the set point that the robot itself publishes, as the envs add it to theirs;
-where that still is an earlier one of those sent, since the last have not been obeyed or heard of
-yet, it is added to the last one, so that nothing is lost on the way. It is sent as `servo_cp` and
-`jaw/servo_jp`, in the frame of the robot's own `setpoint_cp`: a dVRK reads no other, whatever a
-header says.
+An action is added to the set point that the robot itself publishes, as the envs add it to theirs.
+While the robot still publishes an earlier set point, because the last ones sent have not been
+obeyed or reported yet, the action is added to the last one, so that nothing is lost on the way. The
+result is sent as `servo_cp` and `jaw/servo_jp`, in the frame of the robot's own `setpoint_cp`: a
+dVRK reads no other, whatever a header says.
 
-Where the pull-out begins, PSM2 lets go, as the envs make it: the jaw opens, then the tool is drawn
-back along its axis.
+When the pull-out begins, PSM2 lets go as in the envs: the jaw opens, then the tool is drawn back
+along its axis.
 """
 
 import math
@@ -41,12 +41,12 @@ from surgicai_vision.robot.messages import Header, JointState
 RELEASE_OPEN = 0.5
 """Finger's angle to which PSM2 opens when it lets go [rad] (`Simulation._let_go`)."""
 SAME_M = 0.002
-"""Distance within which a set point that was sent still is the one that is obeyed [m]."""
+"""Distance within which a set point that was sent still counts as the one obeyed [m]."""
 PENDING_S = 0.1
-"""Time in which a set point that was sent must be heard of; later it counts as refused [s]."""
+"""Time within which a set point that was sent must be published; else it was refused [s]."""
 EQUAL_M = 1e-5
 EQUAL_RAD = 1e-3
-"""Differences within which a published set point is one that was sent [m] [rad]."""
+"""Differences within which a published set point counts as one that was sent [m] [rad]."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class _Sent:
     """A set point that was sent.
 
     Attributes:
-        time: when [s].
-        heard: what was published then.
+        time: when it was sent [s].
+        heard: the set point that the robot published then.
         command: what was sent.
     """
 
@@ -72,9 +72,9 @@ class Setpoints:
         robot: the robot.
         step: the step size of actions.
         guards: the limits.
-        dead_man: returns for how long the dead-man's switch was last held [s].
-        sends: send what is let through; else nothing is.
-        is_stepped: the simulation's clock is ours; sending lets it take one control step.
+        dead_man: returns the time since the dead-man's switch was last held [s].
+        sends: send what the guards let through; else send nothing.
+        is_stepped: we set the simulation's clock; sending lets it take one control step.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Setpoints:
         """Return why nothing may be sent now, or "".
 
         Args:
-            arms: arms to be moved; None: the active one, and one that lets go.
+            arms: arms to be moved; None: the active one, and one that is letting go.
         """
         limits = self._limits
         states, images = self._robot.input_topics()
@@ -119,7 +119,7 @@ class Setpoints:
         return problem_of_inputs(inputs, operating, self._dead_man())
 
     def _age(self, topic: str) -> float:
-        """Return a message's age [s]; where the clock is ours, all are of the last step."""
+        """Return a message's age [s]; if we set the clock, all are of the last step."""
         age = self._client.age(topic)
         return 0.0 if self._is_stepped and math.isfinite(age) else age
 
@@ -129,7 +129,7 @@ class Setpoints:
         return min(self._client.age(topic) for topic in states)
 
     def youngest_image(self) -> float | None:
-        """Return how long ago the newest image came [s], None where none is seen."""
+        """Return how long ago the newest image came [s], None if the policy sees none."""
         _, images = self._robot.input_topics()
         return min((self._client.age(topic) for topic in images), default=None)
 
@@ -140,7 +140,7 @@ class Setpoints:
 
         Args:
             action: (7,) increments of the active arm, in [-1, 1].
-            now: of the control step [s].
+            now: time of the control step [s].
         """
         robot = self._robot
         return self.of_moves({robot.active: np.asarray(action, np.float64).tolist()}, now)
@@ -152,7 +152,7 @@ class Setpoints:
 
         Args:
             moves: arm → seven increments in [-1, 1].
-            now: of the control step [s].
+            now: time of the control step [s].
         """
         self._now = now
         robot = self._robot
@@ -172,11 +172,11 @@ class Setpoints:
     ) -> tuple[Mapping[str, Command], str]:
         """Return what would be sent at `now` [s] on the way to set points, as `of_action`.
 
-        A set point further away than one step is approached by one step a call.
+        A set point further away than one step is approached by one step per call.
 
         Args:
-            targets: arm → where it should be told to be.
-            now: of the control step [s].
+            targets: arm → the set point to reach.
+            now: time of the control step [s].
         """
         self._now = now
         commands: dict[str, Command] = {}
@@ -194,7 +194,7 @@ class Setpoints:
     def guarded(
         self, commands: Mapping[str, Command], now: float
     ) -> tuple[Mapping[str, Command], str]:
-        """Return what of set points would be sent at `now` [s], and why it may not be, or ""."""
+        """Return which set points would be sent at `now` [s], and why they may not be, or ""."""
         self._now = now
         robot = self._robot
         planned = {}
@@ -202,7 +202,7 @@ class Setpoints:
             base = robot.base_in(arm, self._limits.frame)
             told = self._present(arm)
             plan = Planned(arm, told.pose, robot.measured(arm), command.pose, base)
-            if self._guard.is_outside(plan):  # as an env: the jaw moves, the tip does not
+            if self._guard.is_outside(plan):  # as in an env: the jaw moves, the tip does not
                 command = Command(told.pose, command.jaw)
                 plan = Planned(arm, told.pose, robot.measured(arm), command.pose, base)
             problem = self._guard.problem_of_target(plan, now)
@@ -226,10 +226,10 @@ class Setpoints:
         return Command(poses.shifted_along_z(told.pose, -RELEASE_SHIFT), jaw)
 
     def _present(self, arm: str) -> Command:
-        """Return where an arm is told to be: as published, or as last sent where that is pending.
+        """Return an arm's present set point: as published, or as last sent while that is pending.
 
-        What is published is drawn back towards what is measured; the active arm goes on from there,
-        another one from what was last sent as long as that is near.
+        The published one is drawn back towards the measured pose. The active arm continues from
+        there; another arm continues from what was last sent, as long as that is near.
         """
         told = self._robot.told(arm)
         self._heard[arm] = told
@@ -246,7 +246,7 @@ class Setpoints:
         return last if any(_is_same(told, entry) for entry in before) else told
 
     def send(self, commands: Mapping[str, Command]) -> None:
-        """Send commands, and let a clock that is ours go on."""
+        """Send commands, and take a control step if we set the clock."""
         stamp = self._client.stamp()
         sent = []
         if self._sends:
@@ -272,7 +272,7 @@ class Setpoints:
 
 
 def _is_same(one: Command, other: Command) -> bool:
-    """Return True if two set points differ by rounding alone."""
+    """Return True if two set points differ only by rounding."""
     return (
         poses.distance(one.pose, other.pose) < EQUAL_M
         and poses.angle(one.pose, other.pose) < EQUAL_RAD

@@ -1,9 +1,9 @@
-"""Simulated robot: an env's two arms as a dVRK's, measured and told in its units.
+"""Simulated robot: an env's two arms as those of a dVRK, measured and commanded in its units.
 
 What is measured is what the joints report: an arm that does not know its kinematic error reports
-its pose without it (`Simulation.reported_joints`). A set point is what the servos can still tell
-from the measured joints (`Simulation.within_reach`), so that a client that adds increments to it
-moves as the env's own actions do.
+its pose without it (`Simulation.reported_joints`). A set point is drawn back to where the servos
+still respond to it (`Simulation.within_reach`), so that a client that adds increments to it moves
+the arm as the env's own actions do.
 """
 
 from collections.abc import Callable, Mapping
@@ -64,7 +64,7 @@ class SimulatedRobot:
         self.steps = 0
 
     def enter(self, subtask: str) -> None:
-        """Tell the judge which subtask is on.
+        """Tell the judge which subtask is active.
 
         Raises:
             InputError: no such subtask, or a task of one subtask.
@@ -94,7 +94,7 @@ class SimulatedRobot:
         """Give arms new set points, which `state` returns from now on; nothing moves yet.
 
         Args:
-            targets: arm → where it is told to be; an arm left out stays as it was told.
+            targets: arm → its new set point; an arm left out keeps its own.
         """
         for name, target in targets.items():
             self.env.simulation.command(PSM_NAMES[name], self._command(target))

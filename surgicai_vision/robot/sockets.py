@@ -1,8 +1,8 @@
 """Sockets: keeping a transport to one network interface.
 
-Cyclone DDS and Fast DDS send on the interface they are told, but their receiving sockets are bound
-to every address of the machine; each is therefore bound to the device as well (Linux:
-SO_BINDTODEVICE), and where that is refused nothing is opened.
+Cyclone DDS and Fast DDS send on the interface they are given, but their receiving sockets are bound
+to every address of the machine. Each is therefore bound to the device as well (Linux:
+SO_BINDTODEVICE); if that is refused, nothing is opened.
 """
 
 import os
@@ -16,7 +16,7 @@ LAST_DOMAIN = 232
 
 
 def check_domain(domain: int) -> None:
-    """Refuse a number that is no domain of DDS.
+    """Refuse a number that is not a domain of DDS.
 
     Raises:
         InputError: below 0 or above 232.
@@ -26,7 +26,7 @@ def check_domain(domain: int) -> None:
 
 
 def check_interface(interface: str) -> None:
-    """Refuse a name that is no network interface of this machine.
+    """Refuse a name that is not a network interface of this machine.
 
     Raises:
         InputError: there is none of that name.
@@ -49,7 +49,7 @@ def open_sockets() -> set[int]:
 
 
 def keep_to(descriptors: set[int], interface: str) -> None:
-    """Let sockets hear nothing but what comes in by an interface.
+    """Let sockets receive only what comes in on one interface.
 
     Raises:
         InputError: that is refused; the caller closes what it opened.

@@ -1,9 +1,9 @@
-"""Topics: what each message is called, of which type it is, and how it is kept.
+"""Topics: the name of each, the type of its messages, and how they are kept.
 
-After docs/ros_crtk_contract.md of dvrk_simulator_base (names, types and the QoS of states), its
-ros_interface.py (queue depths) and ros_qos.py. Cameras are not in the contract: theirs are ROS's
-own (`<view>/image_raw`, `…/compressed`, `<view>/camera_info`). The topics under `/simulation` and
-the needle's pose are the simulation's, and no robot has them.
+They follow docs/ros_crtk_contract.md of dvrk_simulator_base (names, types and the QoS of states),
+its ros_interface.py (queue depths) and ros_qos.py. Cameras are not in the contract: theirs are
+ROS's own (`<view>/image_raw`, `…/compressed`, `<view>/camera_info`). Only the simulation has the
+topics under `/simulation` and the needle's pose; no robot has them.
 """
 
 from collections.abc import Iterable
@@ -13,11 +13,11 @@ from types import MappingProxyType
 from surgicai_vision.robot import messages as m
 
 STATE = "state"
-"""Reliable, the last ten; what is sent anew all the time."""
+"""Reliable, the last ten; for what is published continually."""
 EVENT = "event"
-"""Reliable, the last ten, also for those who come later."""
+"""Reliable, the last ten, also for late subscribers."""
 LATCHED = "latched"
-"""Reliable, the last one, also for those who come later."""
+"""Reliable, the last one, also for late subscribers."""
 SERVO = "servo"
 """Reliable, the last one: a set point supersedes the one before."""
 IMAGE = "image"
@@ -25,7 +25,7 @@ IMAGE = "image"
 DEPTHS = MappingProxyType({STATE: 10, EVENT: 10, LATCHED: 1, SERVO: 1, IMAGE: 2})
 """Quality → how many messages are kept."""
 STAYING = (EVENT, LATCHED)
-"""Qualities whose messages are also for those who come later."""
+"""Qualities whose messages are also for late subscribers."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Topic:
     """One topic.
 
     Attributes:
-        name: in full, "/PSM1/measured_js".
+        name: the full name, such as "/PSM1/measured_js".
         type: class of its messages.
         quality: how messages are kept: `STATE`, `EVENT`, `LATCHED`, `SERVO` or `IMAGE`.
     """
@@ -57,7 +57,7 @@ _STATES = MappingProxyType(
         "error": (m.StringStamped, STATE),
     }
 )
-"""What every arm says."""
+"""What every arm publishes."""
 _COMMANDS = MappingProxyType(
     {
         "servo_jp": (m.JointState, SERVO),
@@ -67,7 +67,7 @@ _COMMANDS = MappingProxyType(
         "state_command": (m.StringStamped, STATE),
     }
 )
-"""What every arm hears."""
+"""What every arm subscribes to."""
 _PSM_STATES = MappingProxyType(
     {
         "jaw/measured_js": (m.JointState, STATE),
@@ -77,36 +77,36 @@ _PSM_STATES = MappingProxyType(
         "local/setpoint_cp": (m.PoseStamped, STATE),
     }
 )
-"""What a PSM says besides."""
+"""What a PSM publishes in addition."""
 _PSM_COMMANDS = MappingProxyType(
     {"jaw/servo_jp": (m.JointState, SERVO), "jaw/move_jp": (m.JointState, STATE)}
 )
-"""What a PSM hears besides."""
+"""What a PSM subscribes to in addition."""
 
 NEEDLE = Topic("/needle/measured_cp", m.PoseStamped)
-"""Ground truth: the needle's pose in world. The name is that which `import-demos` looks for."""
+"""Ground truth: the needle's pose in world. The name is the one that `import-demos` looks for."""
 LABEL = Topic("/subtask", m.String)
-"""Ground truth: the subtask under way as the simulation judges it (`import-demos`' label)."""
+"""Ground truth: the active subtask as the simulation judges it (`import-demos`' label)."""
 RESET = Topic("/simulation/reset", m.StringStamped)
-"""Asks for a new episode; the text is its seed."""
+"""Requests a new episode; the text is its seed."""
 ENTER = Topic("/simulation/enter", m.StringStamped)
-"""Tells the simulation's judge which subtask is on; the text is its name, or "" to change nothing:
-then everything is published once more."""
+"""Tells the simulation's judge which subtask is active; the text is its name, or "" to change
+nothing: then everything is published once more."""
 STEP = Topic("/simulation/step", m.StringStamped)
-"""Asks for one control step, where the client sets the clock.
+"""Requests one control step, if the client sets the clock.
 
-The text names the topics, between blanks, whose message with the same stamp must come first.
+The text names the topics, separated by blanks, whose message with the same stamp must come first.
 """
 STEPPED = Topic("/simulation/stepped", m.StringStamped, EVENT)
-"""Answers `RESET`, `ENTER` and `STEP`: the text is the stamp that was asked with, its own stamp is
-that of the states published with it."""
+"""Answers `RESET`, `ENTER` and `STEP`: the text is the stamp of the request, its own stamp is that
+of the states published with it."""
 JUDGEMENT = Topic("/simulation/judgement", m.StringStamped)
 """Ground truth: the judged episode as JSON: seed, steps, subtask, who advances it, progress,
 success, errors."""
 
 
 def psm_topics(name: str, *, heard: bool) -> dict[str, Topic]:
-    """Return channel → topic of a PSM, of what it hears or of what it says."""
+    """Return channel → topic of a PSM, for what it subscribes to or for what it publishes."""
     tables = (_COMMANDS, _PSM_COMMANDS) if heard else (_STATES, _PSM_STATES)
     return {
         channel: Topic(f"/{name}/{channel}", *entry)

@@ -1,9 +1,10 @@
 """Trajectory: how `move_jp` and `move_cp` reach their goal.
 
-All joints start and arrive together, at rest, along the straight line between in joint space, with
-the time law of least jerk; the fastest joint just reaches its speed limit on the way. The contract
-asks for synchronised joints within speed limits (dvrk_simulator_base/trajectory.py, which moves at
-a constant speed); a start and an end at rest spare the needle the jerk.
+All joints start and arrive together, at rest, along the straight line between start and goal in
+joint space, with a minimum-jerk time law. The joint that needs longest just reaches its speed limit
+on the way. The contract requires synchronised joints within speed limits
+(dvrk_simulator_base/trajectory.py, which moves at a constant speed); a start and an end at rest
+spare the needle the jerk.
 """
 
 import math
@@ -13,14 +14,14 @@ from dataclasses import dataclass
 from surgicai_vision.core.errors import InputError
 
 SHORTEST = 1e-9
-"""Duration below which a motion is none [s]."""
+"""Duration below which there is no motion [s]."""
 PEAK = 1.875
-"""Highest speed of s(u) = 10u³ - 15u⁴ + 6u⁵ over its mean: s'(1/2)."""
+"""Ratio of the highest speed of s(u) = 10u³ - 15u⁴ + 6u⁵ to its mean: s'(1/2)."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A place on a trajectory: positions, velocities, and whether it is the end."""
+    """A point of a trajectory: positions, velocities, and whether it is the end."""
 
     position: tuple[float, ...]
     velocity: tuple[float, ...]

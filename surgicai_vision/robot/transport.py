@@ -1,4 +1,4 @@
-"""Transport: what carries messages, and the table of those there are.
+"""Transport: what carries messages, and the table of transports.
 
     with open_transport("cyclonedds", interface="lo", domain=0) as transport:
         publish = transport.publisher(topic)
@@ -7,8 +7,8 @@
         for received in inbox():
             received.message, received.source
 
-A transport has no threads that call back: whoever wants messages takes them, in the order they
-came. Nothing leaves this machine unless another interface than the loopback is named.
+A transport has no threads that call back: messages are taken when they are wanted, in the order in
+which they came. Nothing leaves this machine unless an interface other than the loopback is named.
 """
 
 import dataclasses
@@ -28,12 +28,13 @@ LOOPBACK = "lo"
 
 @dataclass(frozen=True)
 class Received:
-    """A message that came.
+    """A message that was received.
 
     Attributes:
-        message: it.
-        source: who sent it, as the transport tells senders apart.
-        sent: when, by the sender's clock [ns]; it orders what came by several topics.
+        message: the message.
+        source: who sent it, as far as the transport distinguishes senders.
+        sent: when it was sent, by the sender's clock [ns] (with rospy: when it arrived); it orders
+            messages of several topics.
     """
 
     message: Message
@@ -49,16 +50,16 @@ class Transport(Protocol):
     """Carries messages; a context manager."""
 
     def publisher(self, topic: Topic) -> Publish:
-        """Return what publishes messages on a topic."""
+        """Return a function that publishes messages on a topic."""
 
     def inbox(self, topic: Topic) -> Inbox:
-        """Return what takes the messages that have come on a topic since it was last called."""
+        """Return a function that takes a topic's messages that came since its last call."""
 
     def listeners(self, topic: Topic) -> int:
-        """Return how many hear what a publisher of this transport says on a topic."""
+        """Return the number of listeners to this transport's publisher on a topic."""
 
     def wait(self, seconds: float) -> None:
-        """Wait until a message comes, or so long."""
+        """Wait until a message comes, but no longer than `seconds`."""
 
     def __enter__(self) -> Self: ...
 
@@ -67,16 +68,16 @@ class Transport(Protocol):
 
 @final
 class RenamedTransport:
-    """Carries messages of topics that a robot calls otherwise.
+    """Carries messages of topics that a robot calls by other names.
 
     Args:
         inner: what carries them; whoever opened it closes it.
-        renamed: topic of `robot.topics` → the robot's own name of it.
-        views: views whose topics there are.
+        renamed: topic of `robot.topics` → the robot's own name for it.
+        views: views that have topics.
 
     Raises:
-        UnknownName: a topic that there is not.
-        InputError: a name that is none, or two topics of one name.
+        UnknownName: a topic that does not exist.
+        InputError: an invalid name, or two topics with the same name.
     """
 
     def __init__(self, inner: Transport, renamed: Mapping[str, str], views: Iterable[str]):
@@ -99,19 +100,19 @@ class RenamedTransport:
         """Leave the inner transport open."""
 
     def publisher(self, topic: Topic) -> Publish:
-        """Return what publishes messages on a topic."""
+        """Return a function that publishes messages on a topic."""
         return self._inner.publisher(self._own(topic))
 
     def inbox(self, topic: Topic) -> Inbox:
-        """Return what takes the messages that have come on a topic since it was last called."""
+        """Return a function that takes a topic's messages that came since its last call."""
         return self._inner.inbox(self._own(topic))
 
     def listeners(self, topic: Topic) -> int:
-        """Return how many hear what a publisher of this transport says on a topic."""
+        """Return the number of listeners to this transport's publisher on a topic."""
         return self._inner.listeners(self._own(topic))
 
     def wait(self, seconds: float) -> None:
-        """Wait until a message comes, or so long."""
+        """Wait until a message comes, but no longer than `seconds`."""
         self._inner.wait(seconds)
 
     def _own(self, topic: Topic) -> Topic:
@@ -124,7 +125,7 @@ class _Entry:
 
     Attributes:
         place: "module:class" of what carries messages, made with (interface, domain).
-        needs: what to do where something it imports is missing.
+        needs: what to do if something it imports is missing.
     """
 
     place: str
@@ -148,7 +149,7 @@ TRANSPORTS = MappingProxyType(
         ),
     }
 )
-"""Name → what carries messages by it."""
+"""Name → the transport."""
 
 
 def open_transport(name: str, interface: str = LOOPBACK, domain: int = 0) -> Transport:
@@ -156,7 +157,7 @@ def open_transport(name: str, interface: str = LOOPBACK, domain: int = 0) -> Tra
 
     Args:
         name: a key of `TRANSPORTS`.
-        interface: the network interface, by its name or address.
+        interface: name of the network interface.
         domain: ROS's domain number, 0 to 232.
 
     Raises:

@@ -1,14 +1,14 @@
 """Arm: one da Vinci PSM as a MuJoCo kinematic tree, built from the same DH table as `kinematics`.
 
-Bodies follow the modified DH frames; the last one, `tip`, is the wrist-yaw axis, with +z along the
-jaws, ±y the direction in which they open and x their hinge. The jaws' grasp point lies
+Bodies follow the modified DH frames. The last one, `tip`, is on the wrist-yaw axis, with +z along
+the jaws, ±y the direction in which they open, and x along their hinge. The jaws' grasp point lies
 `GRASP_DEPTH` along z.
 
-Actuators are position servos with the natural frequency `BANDWIDTH` on each joint's own inertia,
-gravity compensated: the joints follow a commanded pose as a dVRK's do, and give way to contact by a
-finite stiffness and a limited torque (`TORQUES`). The two fingers are coupled by an equality, so
-that one torque-limited motor closes both (about 10 N each). Numbers without another source were
-measured by `benchmarks/grip.py`.
+Actuators are gravity-compensated position servos with the natural frequency `BANDWIDTH` on each
+joint's own inertia. The joints follow a commanded pose as a dVRK's do, and yield to contact because
+their stiffness is finite and their torque limited (`TORQUES`). The two fingers are coupled by an
+equality, so one torque-limited motor closes both (about 10 N each). Numbers without another source
+were measured by `benchmarks/grip.py`.
 """
 
 import math
@@ -33,12 +33,12 @@ JAW_GAIN = 1.0
 """Gain of the servo of the coupled fingers [N·m/rad]."""
 JAW_TORQUE = 0.2
 """Largest torque of that servo [N·m]: 10 N at each pad. Grips of EndoWrist instruments were
-measured at 2.3 to 39.9 N (Journal of Endourology 25:523, 2011). A needle that meets tissue turns in
-the jaws below 0.1 N·m (`docs/tissue.md`)."""
+measured at 2.3 to 39.9 N (Journal of Endourology 25:523, 2011). Below 0.1 N·m, a needle that meets
+tissue turns in the jaws (`docs/tissue.md`)."""
 JAW_ARMATURE = 1e-4
-"""[kg·m²]: the servo has a natural frequency of 70 rad/s. With an armature of 1e-5 (220
-rad/s) the closing jaws struck the needle at 12 rad/s, 0.25 mm of the pads' way in one physics step:
-with friction drawn 15 % lower it shot out of them in one grasp of three."""
+"""[kg·m²]: gives the servo a natural frequency of 70 rad/s. With an armature of 1e-5 (220 rad/s)
+the closing jaws struck the needle at 12 rad/s, so the pads moved 0.25 mm in one physics step. With
+friction drawn 15 % lower, the needle then shot out of them in one of three grasps."""
 SHAFT_RADIUS = 0.004
 SHAFT_LENGTH = 0.36
 WRIST_RADIUS = 0.003
@@ -50,26 +50,27 @@ TORQUES = MappingProxyType(
         "effective": (0.7, 0.7, 5.0, 0.08, 0.06, 0.06),
     }
 )
-"""Preset → largest torque of the six servos [N·m, the third N].
+"""Preset → largest torque of the six servos [N·m, the third in N].
 
-"dvrk" is what the motors can give: current × gear ratio × torque constant, computed by
-`compute-ftmax.py` of the dVRK's software (sawIntuitiveResearchKit). "effective" is ours: the arm
-presses with at most about 10 N, as a surgeon who feels the tissue would let it; the expert needs at
-most 0.46, 0.39 N·m, 1.85 N, 0.027, 0.010, 0.023 N·m (`benchmarks/press.py` measures the force)."""
+"dvrk" is what the motors can deliver: current × gear ratio × torque constant, computed by
+`compute-ftmax.py` of the dVRK's software (sawIntuitiveResearchKit). "effective" is our choice: the
+arm presses with at most about 10 N, as a surgeon who feels the tissue would allow. The expert needs
+at most 0.46, 0.39 N·m, 1.85 N, 0.027, 0.010, 0.023 N·m (`benchmarks/press.py` measures the
+force)."""
 FASTEST = (1.6, 1.6, 0.13, 6.0, 6.0, 6.0)
-"""Fastest that an action moves a joint [rad/s, the third m/s]: 1.5 mm along each axis and 3° about
-each in 20 ms, the largest step preset, 80 mm from the remote centre."""
+"""Highest speed at which an action moves a joint [rad/s, the third in m/s]: 1.5 mm along each axis
+and 3° about each in 20 ms, the largest step preset, at 80 mm from the remote centre."""
 LIMIT_SOLREF = [0.004, 1.0]
 LIMIT_SOLIMP = [0.99, 0.999, 0.0001, 0.5, 2.0]
-"""Of joint limits, of the fingers' coupling and of the weld: a servo told to go 0.5 rad past a
-limit rests within 0.1 mrad of it; with MuJoCo's default it stood 83 mrad beyond."""
+"""For joint limits and the fingers' coupling; the weld takes the solref. A servo commanded 0.5 rad
+past a limit rests within 0.1 mrad of it; with MuJoCo's default it rested 83 mrad beyond."""
 WELD_SOLIMP = [0.999, 0.9999, 0.0001, 0.5, 2.0]
 WELD_TORQUE_SCALE = 0.1
-"""[m]. With frictionless jaws that squeeze with 10 N the needle then turns by at most 0.5° in 1 s
-of motion; with the limits' impedance and 0.01 m it turned by 9° to 130°."""
+"""[m]. With this, a needle squeezed with 10 N by frictionless jaws turns by at most 0.5° in 1 s of
+motion; with the impedance of the joint limits and 0.01 m it turned by 9° to 130°."""
 ARMATURE = (0.02, 0.02, 0.5, 2e-4, 1e-4, 1e-4)
 MASSES = (0.01, 0.01, 0.05, 0.005, 0.005, 0.004)
-"""Link masses [kg]; small beside the armature, which stands for the geared motors."""
+"""Link masses [kg]; small compared with the armature, which represents the geared motors."""
 
 
 def add_arm(
@@ -162,9 +163,9 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, index: int, torque: float) -> No
 
 
 def leads(torque: str) -> tuple[float, ...]:
-    """Return how far a command can be ahead of each joint to any effect [rad, the third m].
+    """Return how far a command can usefully be ahead of each joint [rad, the third in m].
 
-    The servo then gives its largest torque at rest, and the joint moves as fast as any action asks.
+    There the servo gives its largest torque even while the joint moves as fast as any action does.
     """
     return tuple(
         limit / (armature * BANDWIDTH**2) + 2.0 * speed / BANDWIDTH
@@ -216,7 +217,7 @@ def _add_finger(tip: mujoco.MjsBody, name: str, side: float, bits: dict[str, int
 
 
 def _couple_fingers(spec: mujoco.MjSpec, arm: str) -> None:
-    """Tie the right finger's angle to the left one's, and drive both by one motor."""
+    """Tie the right finger's angle to the left one's, and drive both with one motor."""
     equality = spec.add_equality(name=f"{arm}_fingers", type=mujoco.mjtEq.mjEQ_JOINT)
     equality.name1 = f"{arm}_right_finger"
     equality.name2 = f"{arm}_left_finger"

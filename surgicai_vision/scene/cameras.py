@@ -1,20 +1,21 @@
 """Cameras: their poses, and the matrices that project a point of the world to a pixel.
 
 Pixels and camera frames follow OpenCV: x right, y down, z forward; the centre of the first pixel is
-(0, 0), so the principal point of a W × H image is ((W - 1) / 2, (H - 1) / 2). A point p of the
-world has the pixel `K (R p + t)` divided by its third component, with `K = intrinsics(…)` and `[R
-t] = inverse(extrinsics(…))`.
+(0, 0), so the principal point of a W × H image is ((W - 1) / 2, (H - 1) / 2). A world point p is
+projected to the pixel `K (R p + t)`, divided by its third component, with `K = intrinsics(…)` and
+`[R t] = inverse(extrinsics(…))`.
 
-Sources: "front" is the left endoscope of SurgicAI's scene, moved as `ENDOSCOPE` says; "front_right"
-the right one; "back" the camera opposite to them. "endo_left" and "endo_right" are the eyes of a da
-Vinci Xi's endoscope in the same place, with its baseline, field of view and sensor. They stand
-beside SurgicAI's, whose names, toe-in and 4 : 3 image the comparison with its paper needs. The
-surgical robotics challenge also puts a camera on each insertion link; there it looks along the
-shaft and sees little else, so ours stand off it and aim at the jaws.
+Sources: "front" is the left endoscope of SurgicAI's scene, moved as described at `ENDOSCOPE`;
+"front_right" is the right one, and "back" the camera opposite them. "endo_left" and "endo_right"
+are the eyes of a da Vinci Xi's endoscope in the same place, with its baseline, field of view and
+sensor. SurgicAI's cameras are kept alongside them, because the comparison with its paper needs
+their names, toe-in and 4 : 3 image. The surgical robotics challenge also puts a camera on each
+insertion link; there it looks along the shaft and sees little else, so ours stand off the shaft and
+aim at the jaws.
 
-A crop ("front_psm2" and its like, `scene.crops`) is no camera of the scene: it is a window of the
-image that its camera takes at a higher resolution. It has its camera's pose, and that camera's K
-with the principal point moved by the window's corner.
+A crop ("front_psm2" and the like, `scene.crops`) is not a camera of the scene but a window of the
+image that its camera takes at a higher resolution. It has that camera's pose, and that camera's K
+with the principal point shifted by the window's corner.
 """
 
 import math
@@ -38,18 +39,18 @@ Vector = tuple[float, float, float]
 
 
 class Camera(Protocol):
-    """What stands in a scene under a camera's name."""
+    """What a camera's name stands for in a scene: a camera or a crop."""
 
     def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
         """Add it to a scene with both arms, whose PSMs carry `instrument`."""
 
 
 class Window(NamedTuple):
-    """Where a crop lies in its camera's whole image [pixel]; the crop's own size is the image's.
+    """Where a crop lies in its camera's whole image [pixel]; its size is that of the drawn image.
 
     Attributes:
-        left: column of the whole in which the crop begins.
-        top: row of the whole in which it begins.
+        left: column of the whole image in which the crop begins.
+        top: row of the whole image in which it begins.
         height: of the whole image.
         width: of the whole image.
     """
@@ -61,11 +62,11 @@ class Window(NamedTuple):
 
 
 PARALLEL = 1e-6
-"""Sine of the angle below which two vectors have one direction."""
+"""Sine of the angle below which two vectors count as parallel."""
 
 
 def _check_vector(name: str, values: object) -> None:
-    """Refuse what is no vector of three finite numbers."""
+    """Refuse anything but a vector of three finite numbers."""
     try:
         vector = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -80,13 +81,13 @@ class CameraPose:
 
     Attributes:
         position: the optical centre [m].
-        direction: of view; need not be a unit vector.
-        up: any vector in the upper half of the image, not along `direction`.
+        direction: viewing direction; need not be a unit vector.
+        up: any vector that points to the upper half of the image, not along `direction`.
         fovy: vertical field of view [rad], between 0 and π.
         body: name of the body that carries it; the world by default.
 
     Raises:
-        InputError: what no camera can have.
+        InputError: a value that no camera can have.
     """
 
     position: Vector
@@ -142,10 +143,10 @@ class WristCamera:
 
 @dataclass(frozen=True)
 class Crop:
-    """A window of a camera's image about the place where an arm reports its jaws.
+    """A window of a camera's image around the place where an arm reports its jaws.
 
-    The place is known from the arm's reported joints and the camera's nominal calibration
-    (`envs.calibration`), never from the scene.
+    The place is computed from the arm's reported joints and the camera's nominal calibration
+    (`envs.calibration`), never taken from the scene.
 
     Attributes:
         camera: name of the camera whose image is cropped.
@@ -162,13 +163,13 @@ class Crop:
     aspect: float = 4.0 / 3.0
 
     def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
-        """Add nothing: the camera whose image is cropped stands in the scene."""
+        """Add nothing: the camera whose image is cropped is already in the scene."""
 
 
 def look_at(direction: Vector, up: Vector) -> Array:
     """Return the rotation (3, 3) of an OpenCV camera frame that looks along `direction`.
 
-    `up` shows upwards in its image.
+    `up` points upwards in its image.
     """
     forward: Array = np.array(direction, dtype=np.float64)
     forward /= np.linalg.norm(forward)
@@ -180,20 +181,20 @@ def look_at(direction: Vector, up: Vector) -> Array:
 ENDOSCOPE = (-0.008, 0.100, 0.160)
 ENDOSCOPE_DIRECTION = (0.040, -0.451, -0.892)
 ENDOSCOPE_FOVY = 0.9
-"""The endoscope's middle [m], its direction, and the vertical field of view [rad] of both its
+"""The endoscope's midpoint [m], its direction, and the vertical field of view [rad] of both its
 cameras.
 
 SurgicAI's endoscope is at (0, 114.2, 148.8) mm, looks along (0, -0.642, -0.765) and sees 1.2 rad at
-640 × 480. There, at 224 × 224, the needle covers 31 pixels at the end of a handoff even without the
-arms; and PSM2 holds it along the wound, which is the line of sight, so that placing ends with 5 to
-15 pixels in view. Moved 8 mm to PSM2's side, 14 mm forwards and 11 mm up, with 0.9 rad, it sees
-more than 25 at the end of grasp, place, insert and handoff, and both arms at the start
-(`tests/scene/test_visibility.py`).
+640 × 480. From there, at 224 × 224, the needle covers 31 pixels at the end of a handoff even
+without the arms. PSM2 holds it along the wound, which is also the line of sight, so place ends with
+5 to 15 pixels in view. Moved 8 mm to PSM2's side, 14 mm forwards and 11 mm up, with 0.9 rad, the
+endoscope sees more than 25 pixels of it at the end of grasp, place, insert and handoff, and both
+arms at the start (`tests/scene/test_visibility.py`).
 """
 BASELINE = 0.004
 """Distance between the endoscope's two cameras [m] (SurgicAI)."""
 TOE_IN = 0.040
-"""x of the direction of each of them, 2.3° (SurgicAI)."""
+"""x component of the direction of each of them, 2.3° (SurgicAI)."""
 
 
 def _endoscope(side: float) -> CameraPose:
@@ -214,12 +215,12 @@ def _endoscope(side: float) -> CameraPose:
 DA_VINCI_SIZE = (1024, 1280)
 """Height and width of a da Vinci Xi's images [pixel] (EndoVis 2017)."""
 DA_VINCI_FOCAL = 1084.0
-"""Focal length of both its eyes [pixel]: 50.6° high and 61.1° wide.
+"""Focal length of both its eyes [pixel]; they see 50.6° in height and 61.1° in width.
 
 Source: a calibration of the da Vinci Xi of the EndoVis 2017 challenges (kidney boundary detection,
 data set 18, quoted in the README of ghattab/kidney-edge-detection): 1084.21, 1084.05 pixels left,
-1083.43, 1083.22 right. Both principal points lie 50 pixels inwards there, which shifts the images
-and changes no ray: left out, as is the lens's distortion (k1 below .001).
+1083.43, 1083.22 right. Both principal points lie 50 pixels inwards there. This shifts the images
+but changes no ray, so it is left out, as is the lens distortion (k1 below .001).
 """
 DA_VINCI_FOVY = 2.0 * math.atan(DA_VINCI_SIZE[0] / 2.0 / DA_VINCI_FOCAL)
 """Vertical field of view of its eyes [rad]."""
@@ -228,13 +229,13 @@ DA_VINCI_BASELINE = 0.00435
 DA_VINCI_SHAFT = 0.0044
 """Radius of its shaft [m]: an "8 mm endoscope" through an 8.8 mm cannula."""
 DA_VINCI_TILT = math.radians(30.0)
-"""Angle between its shaft and its axis [rad]: the 30° endoscope, looking down; there is one of 0°
-too. The shaft is not drawn: it comes from between the arms' ports, over both
+"""Angle between its shaft and its optical axis [rad]: the 30° endoscope, looking down; there is one
+of 0° too. The shaft is not drawn: it comes from between the arms' ports and passes over both
 (`tests/scene/test_endoscope.py`)."""
 
 
 def _da_vinci(side: float) -> CameraPose:
-    """Return the left (side = 1) or the right (-1) eye, about SurgicAI's middle, axes parallel."""
+    """Return the left (side = 1) or the right (-1) eye, about `ENDOSCOPE`, axes parallel."""
     rotation = look_at(ENDOSCOPE_DIRECTION, (0.0, 0.0, 1.0))
     x, y, z = np.array(ENDOSCOPE) - rotation[:, 0] * side * DA_VINCI_BASELINE / 2.0
     return CameraPose(
@@ -248,7 +249,7 @@ def _da_vinci(side: float) -> CameraPose:
 FRONT = _endoscope(1.0)
 FRONT_RIGHT = _endoscope(-1.0)
 BACK = CameraPose((0.0, -0.0359, 0.1659), (0.0, 0.707, -0.707), (0.0, 0.707, 0.707), 0.8)
-"""Poses in world; "back" stands where SurgicAI's does."""
+"""Poses in world; "back" is where SurgicAI's is."""
 ENDO_LEFT = _da_vinci(1.0)
 ENDO_RIGHT = _da_vinci(-1.0)
 WRIST_PSM1 = WristCamera(PSM1)
@@ -259,15 +260,15 @@ WRIST_ASIDE = 0.030
 WRIST_BACK = 0.030
 """Distance from the wrist's pitch axis to the wrist camera, up along the shaft [m].
 
-With both, the view meets the shaft at 33°: far enough to look past it at the jaws, and clear of the
-tissue in every grasp of the five subtasks.
+With these two distances the line of sight meets the shaft at 33°: enough to look past it at the
+jaws, with the camera clear of the tissue in every grasp of the five subtasks.
 """
 WRIST_SIDE = MappingProxyType(
     {PSM1: (-math.sqrt(0.5), -math.sqrt(0.5)), PSM2: (-math.sqrt(0.5), math.sqrt(0.5))}
 )
-"""Arm → side of the shaft on which its camera stands, in x and y of the insertion link: above and
-outside, where of eight sides tried the jaws, the needle and the holes were seen best at the ends of
-all subtasks."""
+"""Arm → side of the shaft on which its camera is, in x and y of the insertion link: above and
+outside. Of the eight sides tried, this one showed the jaws, the needle and the holes best at the
+ends of all subtasks."""
 WRIST_TARGET = 0.017
 """Point beyond the wrist's pitch axis at which the wrist camera aims [m]: 2 mm before the grasp."""
 WRIST_FOVY = 0.8
@@ -290,7 +291,7 @@ def add_cameras(spec: mujoco.MjSpec, names: Iterable[str], instrument: str) -> N
     """Add the cameras called `names` to a scene with both arms.
 
     Raises:
-        InputError: a camera of another distribution that is none, or cannot be added.
+        InputError: a camera of another distribution is not a camera, or cannot be added.
     """
     for name in names:
         camera = CAMERAS.load(name)
@@ -308,7 +309,7 @@ def intrinsics(
         camera: name of a camera, or of a crop.
         height: of the image [pixel].
         width: of the image [pixel].
-        window: where the image lies in the camera's whole one; a crop needs it.
+        window: where the image lies in the camera's whole image; required for a crop.
 
     Raises:
         UnknownName: no such camera in the model.
@@ -332,7 +333,9 @@ def intrinsics(
 
 
 def extrinsics(model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> Array:
-    """Return T_world_camera (4, 4) at the state of `data`, after `mj_forward`; a crop's camera's.
+    """Return T_world_camera (4, 4) in the state `data`, after `mj_forward`.
+
+    A crop has the pose of its camera.
 
     Raises:
         UnknownName: no such camera in the model.
@@ -345,7 +348,7 @@ def extrinsics(model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> Array
 
 
 def crop_of(view: str) -> Crop | None:
-    """Return the crop called `view`, None if that is a camera of the scene or no name of ours."""
+    """Return the crop called `view`, or None for a camera of the scene or an unknown name."""
     part = CAMERAS.load(view) if view in CAMERAS.names() else None
     return part if isinstance(part, Crop) else None
 
@@ -357,7 +360,7 @@ def stand(view: str) -> str:
 
 
 def camera_id(model: mujoco.MjModel, camera: str) -> int:
-    """Return the index of a camera by its name, of a crop that of its camera.
+    """Return the index of a camera by its name; for a crop, that of its camera.
 
     Raises:
         UnknownName: listing the model's cameras.

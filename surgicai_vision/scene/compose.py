@@ -2,11 +2,10 @@
 
 Interface: `build_scene(config) -> Scene`, cached per process. `Scene` holds the model, the ids that
 later stages need, and the scene hash: sha256 over the compiled XML and the configuration, so any
-change of geometry changes it.
+change of geometry changes the hash.
 
 World: metres, z up, gravity 9.81 m/s². Solver settings are those under which a friction grasp holds
-(`benchmarks/grip.py` shows what each of them is worth): Newton, elliptic cones, impratio 100,
-Euler, 2 ms.
+(`benchmarks/grip.py` shows the effect of each): Newton, elliptic cones, impratio 100, Euler, 2 ms.
 """
 
 import functools
@@ -28,8 +27,8 @@ from surgicai_vision.scene.visual import materials, skin
 
 TIMESTEP = 0.002
 USER_DATA = 208
-"""Numbers the envs keep inside MuJoCo's state (goal, progress), so that one vector is the whole
-state.
+"""How many numbers the envs keep inside MuJoCo's state (goal, progress), so that one vector is the
+whole state.
 """
 
 # Collision bits.
@@ -47,7 +46,7 @@ THREAD = 16
 
 @dataclass(frozen=True)
 class ArmIds:
-    """Where one arm's numbers stand in MuJoCo's arrays."""
+    """Indices of one arm in MuJoCo's arrays."""
 
     qpos: slice
     finger_qpos: int
@@ -64,16 +63,17 @@ class Scene:
     """A compiled scene.
 
     Attributes:
-        model: the MuJoCo model; shared, not to be written by envs without randomisation.
+        model: the MuJoCo model; shared, so envs without randomisation must not write to it.
         config: what it was built from.
         hash: sha256 (hex) of the compiled XML and the configuration.
         instrument: the PSM instrument.
         arms: arm name → its ids.
-        leads: how far a command can be ahead of each joint (`arm.leads`) [rad, the third m].
+        leads: how far a command can usefully be ahead of each joint (`arm.leads`) [rad, the third
+            in m].
         pair: the hole pair of this scene's stitch.
         needle_qpos: the needle's position and quaternion in qpos.
         needle_geoms: ids of the needle's capsules, from base to tip.
-        ink_geoms: ids of the ink about each hole pair, where each has its own; else none.
+        ink_geoms: ids of the ink around each hole pair, if each has its own; else empty.
     """
 
     model: mujoco.MjModel
@@ -108,14 +108,14 @@ def build_scene(config: SceneConfig = SceneConfig()) -> Scene:
     """Return the compiled scene of `config`, the same object as long as no camera is registered.
 
     The cameras of other distributions come last and are not in the hash: a camera has no mass, so
-    whatever else is in a scene moves and looks as it does without them.
+    everything else in the scene moves and looks the same without them.
     """
     return _build_scene(config, other_cameras())
 
 
 @functools.lru_cache(maxsize=8)
 def _build_scene(config: SceneConfig, others: tuple[str, ...]) -> Scene:
-    """Build the scene of `config` with the cameras `others` beside ours."""
+    """Build the scene of `config` with the cameras `others` in addition to ours."""
     spec = build_spec(config)
     model = spec.compile()
     text = spec.to_xml() + configuration.digest(configuration.to_identity(config))
@@ -200,12 +200,12 @@ def _add_arm(spec: mujoco.MjSpec, config: SceneConfig, name: str) -> None:
 def _set_options(spec: mujoco.MjSpec, thread: int) -> None:
     """Set the solver, the visual ranges and the size of the user data.
 
-    Joint damping is explicit. MuJoCo's Euler would take it implicitly after the contact solver: the
-    accelerations that start the next solution are then not those of the last, the solver takes 2.4
-    iterations in place of 1.3, and once in some thousand steps it ends far off and kicks the held
-    needle (`benchmarks/grip.py`: 4.6° in the worst of 40 trials, 0.9° without). A thread is one
-    island with all it touches: solving without islands and with a sparse Jacobian then takes 15 %
-    less of a step.
+    Joint damping is explicit. MuJoCo's Euler would apply it implicitly, after the contact solver.
+    The accelerations that start the next solution would then not be those of the last one: the
+    solver takes 2.4 iterations instead of 1.3, and once in some thousand steps it ends far off and
+    kicks the held needle (`benchmarks/grip.py`: 4.6° in the worst of 40 trials, 0.9° without). A
+    thread forms one island with everything it touches, so solving without islands and with a sparse
+    Jacobian saves 15 % of a step.
     """
     option = spec.option
     option.timestep = TIMESTEP

@@ -1,15 +1,15 @@
-"""Crops: windows of a camera's image about an arm's jaws, and where they lie in it.
+"""Crops: windows of a camera's image around an arm's jaws, and where they lie in it.
 
     whole = whole_size(crop, fovy, 224, 224)          # height and width of the whole image [pixel]
     window = window_about(crop, point_in_camera, fovy, 224, 224)
     renderer.render(data, crop.camera, "rgb", window)
 
-The whole image has so many pixels that `crop.span` at `crop.distance` covers the crop's height. The
-window is centred on the projection of a point, rounded to whole pixels, and kept inside the image:
-where the point is near the border, or outside, the crop shows the border's part of the image.
+The whole image is so large that `crop.span` at `crop.distance` covers the crop's height. The window
+is centred on the projection of a point, rounded to whole pixels, and kept inside the image: if the
+point is near the border, or outside, the crop shows the part of the image at that border.
 
-A crop is thus what the camera sees, cut out: it does not turn to the jaws, and what is farther from
-the camera's axis is drawn as obliquely as in the whole.
+A crop is thus cut out of what the camera sees: it does not turn towards the jaws, and objects
+farther from the camera's axis appear as oblique as in the whole image.
 """
 
 import math
@@ -27,20 +27,20 @@ from surgicai_vision.scene.cameras import (
 )
 
 SPAN = 0.050
-"""Height of what a crop shows at the holes [m]: at 224 × 224 pixels 0.22 mm a pixel, where "front"
-and "back" have 0.43 and 0.47; two and a half needles, and the jaws at their middle. Of 50, 30 and
-20 mm it is the one from which a probe reads the needle's tip best (`benchmarks/crop_span.py`,
-docs/envs.md)."""
+"""Height of what a crop shows at the holes [m]: at 224 × 224 pixels 0.22 mm per pixel, where
+"front" and "back" have 0.43 and 0.47. It holds two and a half needles, with the jaws in the middle.
+Of 50, 30 and 20 mm it is the span from which a probe reads the needle's tip best
+(`benchmarks/crop_span.py`, docs/envs.md)."""
 CROPPED = (0.0, 0.050, 0.075)
-"""Point in world [m] at whose distance that holds: between the holes and the needle's home."""
+"""Point in world [m] at whose distance the span holds: between the holes and the needle's home."""
 LARGEST = 16384
 """Largest side of a whole image [pixel]: OpenGL's largest viewport, in Mesa as on GPUs."""
 NEAREST = 0.001
-"""Distance along the camera's axis [m] that a point has at least: none lies behind the lens."""
+"""Least distance of a point along the camera's axis [m], so that none lies behind the lens."""
 
 
 def _crops(camera: str, stand: Vector, aspect: float) -> tuple[Crop, Crop]:
-    """Return the crops about psm1 and psm2 of a camera that stands at a point in world [m]."""
+    """Return the crops around psm1 and psm2 of a camera at the world point `stand` [m]."""
     distance = math.dist(stand, CROPPED)
     first, second = (Crop(camera, arm, distance, SPAN, aspect) for arm in (PSM1, PSM2))
     return first, second
@@ -50,7 +50,7 @@ _SURGICAI = 640 / 480
 _DA_VINCI = DA_VINCI_SIZE[1] / DA_VINCI_SIZE[0]
 FRONT_PSM1, FRONT_PSM2 = _crops("front", FRONT.position, _SURGICAI)
 BACK_PSM1, BACK_PSM2 = _crops("back", BACK.position, _SURGICAI)
-# Both eyes' crops are of one scale: that of the middle between them.
+# The crops of both eyes have one scale: that of the midpoint between them.
 ENDO_LEFT_PSM1, ENDO_LEFT_PSM2 = _crops("endo_left", ENDOSCOPE, _DA_VINCI)
 ENDO_RIGHT_PSM1, ENDO_RIGHT_PSM2 = _crops("endo_right", ENDOSCOPE, _DA_VINCI)
 
@@ -87,7 +87,7 @@ def whole_size(crop: Crop, fovy: float, height: int, width: int) -> tuple[int, i
 
 
 def window_about(crop: Crop, point: Vector, fovy: float, height: int, width: int) -> Window:
-    """Return the window of a crop about a point.
+    """Return the window of a crop around a point.
 
     Args:
         crop: the crop.

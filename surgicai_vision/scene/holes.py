@@ -60,13 +60,13 @@ class Hole:
         return self.axes[2]
 
     def height(self, point: Point) -> float:
-        """Return the signed distance [m] of a point of the world over the hole's plane."""
+        """Return the signed height [m] of a world point above the hole's plane."""
         x, y, z = self.centre
         a, b, c = self.axes[2]
         return a * (point[0] - x) + b * (point[1] - y) + c * (point[2] - z)
 
     def local(self, point: Point) -> Point:
-        """Return a point of the world in the hole's frame [m]."""
+        """Return a world point in the hole's frame [m]."""
         x, y, z = self.centre
         dx = point[0] - x
         dy = point[1] - y

@@ -1,9 +1,9 @@
 """Kinematics of the da Vinci patient-side manipulator (PSM): joints ⇄ pose of the tool tip.
 
-The pose is in the arm's base.
+The pose is in the arm's base frame.
 
 `Instrument.dh` is the modified DH table that the surgical robotics challenge publishes. The base
-origin is the remote centre of motion: the shaft passes through it, so both directions are closed
+origin is the remote centre of motion: the shaft passes through it, so both directions have closed
 forms. Multiplied out, with L = L_tool - L_rcc and s, c for sine and cosine:
 
     shaft  z3 = (s1 c2, -s2, -c1 c2),  x3 = (-s1 s2, -c2, c1 s2),  y3 = (-c1, 0, -s1)
@@ -46,7 +46,7 @@ DVRK_JOINTS = (
     "outer_wrist_pitch",
     "outer_wrist_yaw",
 )
-"""The dVRK's names; a joint in the model is f"{arm}_{name}"."""
+"""The dVRK's names; a joint in the model is called f"{arm}_{name}"."""
 INSERTION = DVRK_JOINTS.index("outer_insertion")
 
 TOLERANCE = 1e-9
@@ -56,7 +56,7 @@ TOLERANCE = 1e-9
 class Row(NamedTuple):
     """One row: RotX(alpha) TransX(a) RotZ(q + offset) TransZ(d) [rad, m].
 
-    Where `prismatic`, q adds to d.
+    If `prismatic`, q is added to d.
     """
 
     alpha: float
@@ -71,7 +71,7 @@ class Instrument:
     """Lengths [m] and joint limits of a PSM with one instrument.
 
     Attributes:
-        name: Intuitive's number of the instrument.
+        name: Intuitive's number for the instrument.
         rcc: L_rcc, from the remote centre to the tool carriage at zero insertion.
         tool: L_tool, from the carriage to the wrist's pitch axis.
         limits: lower and upper limit of the six joints in the order of `DVRK_JOINTS` [rad, m].
@@ -88,14 +88,14 @@ class Instrument:
 
     @functools.cached_property
     def bounds(self) -> tuple[float, ...]:
-        """Return the lower and upper limit of each joint, `TOLERANCE` wider, in one row."""
+        """Return the lower and upper limit of each joint, `TOLERANCE` wider, in one tuple."""
         return tuple(
             edge for low, high in self.limits for edge in (low - TOLERANCE, high + TOLERANCE)
         )
 
     @property
     def dh(self) -> tuple[Row, ...]:
-        """Return the table: six joints and the fixed tip."""
+        """Return the DH table: six joints and the fixed tip."""
         right = pi / 2
         first = Row(right, 0.0, 0.0, right)
         second = Row(-right, 0.0, 0.0, -right)
@@ -107,7 +107,7 @@ class Instrument:
 
 
 def _limits(*degrees: float) -> tuple[tuple[float, float], ...]:
-    """Return symmetric limits of the five turning joints and 0..0.24 m of insertion."""
+    """Return symmetric limits of the five revolute joints and 0..0.24 m of insertion."""
     turning = [(-radians(angle), radians(angle)) for angle in degrees]
     return (*turning[:INSERTION], (0.0, 0.24), *turning[INSERTION:])
 
@@ -191,11 +191,11 @@ def inverse(
 
     Args:
         near: joints (6,) the arm comes from. The roll is then unwrapped towards them: a pose that
-            is only reached by turning the roll back through its whole range is refused. Without it,
-            any solution will do.
+            can only be reached by turning the roll back through its whole range is refused. Without
+            `near`, any solution will do.
 
     Raises:
-        UnreachablePose: outside a joint limit; names joint, value and limit.
+        UnreachablePose: outside a joint limit; the message names joint, value and limit.
         InputError: not a (4, 4) matrix of finite numbers.
     """
     check_name("instrument", instrument, INSTRUMENTS)
@@ -240,11 +240,11 @@ def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = No
     """Return the joints of a tip pose given as twelve floats; see `inverse`."""
     px, py, pz, ax, yx, bx, ay, yy, by, az, yz, bz = pose
     length = INSTRUMENTS[instrument]
-    # The pitch axis e stands on the plane of the shaft and the yaw axis a, which holds the base
-    # origin and the tip.
+    # The pitch axis e is normal to the plane of the shaft and the yaw axis a, which contains the
+    # base origin and the tip.
     ex, ey, ez = py * az - pz * ay, pz * ax - px * az, px * ay - py * ax
     norm = sqrt(ex * ex + ey * ey + ez * ez)
-    if norm < 1e-12:  # the yaw axis passes through the remote centre: any wrist yaw is right
+    if norm < 1e-12:  # the yaw axis passes through the remote centre: any wrist yaw will do
         ex = yx
         ey = yy
         ez = yz
@@ -260,7 +260,7 @@ def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = No
     depth = sqrt(wx * wx + wy * wy + wz * wz)
     offset = length.rcc - length.tool
     geometry = (ux, uy, uz, ex, ey, ez, ax, ay, az)
-    if depth < 1e-12:  # the wrist is in the remote centre: any shaft is right, take the pitch link
+    if depth < 1e-12:  # the wrist is at the remote centre: any shaft will do, take the pitch link
         return _checked((*_shaft(ux, uy, uz, offset, geometry, near), q6), length)
     joints = (*_shaft(wx / depth, wy / depth, wz / depth, depth + offset, geometry, near), q6)
     # The wrist may be behind the remote centre: instrument 400006 inserted by less than 23 mm.
@@ -294,7 +294,7 @@ def _shaft(
 
 
 def _better(first: Joints, second: Joints, instrument: Instrument, near: Joints | None) -> Joints:
-    """Return the solution within limits, or the one nearer to `near`, or to zero."""
+    """Return the solution within limits; of two, the one nearer to `near`, or else to zero."""
     within = [joints for joints in (first, second) if _violation(joints, instrument) < 0]
     return min(within or (first, second), key=lambda joints: math.dist(joints, near or (0.0,) * 6))
 

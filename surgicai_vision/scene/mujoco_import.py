@@ -1,8 +1,8 @@
-"""MuJoCo where $MUJOCO_GL names a library of OpenGL that this machine lacks, or none at all.
+"""Import MuJoCo even where $MUJOCO_GL names an OpenGL library this machine lacks, or no library.
 
-`import mujoco` ends in an error there, though physics needs no OpenGL: PyOpenGL leaves None in the
-place of a library that it cannot load, and MuJoCo refuses names that it does not know. Packages
-that import MuJoCo import this module first; drawing is refused when it is asked for, in plain words
+There, `import mujoco` fails although physics needs no OpenGL: PyOpenGL leaves None instead of a
+library that it cannot load, and MuJoCo refuses names that it does not know. Packages that import
+MuJoCo import this module first. Drawing is refused only when it is requested, with a plain message
 (`scene.opengl`).
 """
 

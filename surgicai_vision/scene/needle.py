@@ -1,6 +1,6 @@
 """Needle: a rigid arc of capsules, one free body whose origin is the centre of the arc.
 
-Needle frame (facts of SurgicAI's released code): the point at angle θ [rad] is p(θ) = (-R cos θ, R
+Needle frame (as in SurgicAI's released code): the point at angle θ [rad] is p(θ) = (-R cos θ, R
 sin θ, 0); 0 is the base, where the thread is tied, `TIP_ANGLE` the tip; +z is the normal of the
 needle's plane.
 
@@ -29,15 +29,17 @@ MASS = 0.0002
 """[kg]; a steel needle of this size."""
 ARMATURE = 1e-8
 """Added to the needle's inertia [kg·m²] and, without effect, to its mass [kg]. A needle that tissue
-loads while a strong grip squeezes it out would spin up: without it the physics broke off 2 to 3 of
-60 to 120 random episodes in soft tissue, with it none of 150."""
+loads while a strong grip squeezes it out would otherwise spin up: without the armature, 2 to 3 of
+60 to 120 random episodes in soft tissue ended in a physics error; with it, none of 150."""
 DRAG = 2e-7
-"""Drag of the free needle [N·s/m and N·m·s/rad]. It slows a fall by 0.1 % a second, and it takes
-the energy that the explicit integrator would otherwise feed into a fast spin: without it one random
-episode in seventy diverged. Damping is explicit (`compose`), so it must stay below 2 I / dt: about
-the needle's chord, its least inertia, I is 4.7e-10 kg m², the limit 4.7e-7."""
+"""Drag of the free needle [N·s/m and N·m·s/rad]. It slows a fall by 0.1 % per second, and it
+removes the energy that the explicit integrator would otherwise feed into a fast spin: without it
+one random episode in seventy diverged. Damping is explicit (`compose`), so it must stay below
+2 I / dt. About the needle's chord, where its inertia is least, I is 4.7e-10 kg m² and the limit is
+4.7e-7."""
 HOME = np.array([-0.02079, 0.05620, 0.07171])
-"""Needle frame at the centre of the start distribution, lying flat [m, world]."""
+"""Origin of the needle frame at the centre of the start distribution, where the needle lies flat
+[m, world]."""
 
 CONTACT = {
     "condim": 4,
@@ -45,9 +47,9 @@ CONTACT = {
     "solref": [0.004, 1.0],
     "solimp": [0.99, 0.999, 0.0001, 0.5, 2.0],
 }
-"""Stiff contact with strong torsional friction, for the serrated jaws of a needle driver: what lets
-two flat pads hold a round needle. With the default 0.005 m the grip crept 0.7° in ten seconds, 2.2°
-at most; with 0.01 m 0.4° and 1.2°."""
+"""Stiff contact with strong torsional friction, for the serrated jaws of a needle driver: it lets
+two flat pads hold a round needle. With the default torsional friction of 0.005 m the grip crept
+0.7° in ten seconds, 2.2° at most; with 0.01 m, 0.4° and 1.2°."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class NeedleShape:
 
     Attributes:
         radius: of the arc [m].
-        tip_angle: of the tip [rad]: how much of a circle the needle is.
+        tip_angle: of the tip [rad]: how much of a circle the needle covers.
         body_radius: half of its thickness [m].
     """
 
@@ -68,8 +70,8 @@ class NeedleShape:
     def mass(self) -> float:
         """Return its mass [kg], in proportion to its length, not to its thickness.
 
-        The stiffness of MuJoCo's contacts goes with the mass. With half of it the pads of a grip of
-        10 N pressed 0.3 mm into a needle of 0.2 mm and shot it away.
+        The stiffness of MuJoCo's contacts grows with the mass. With half of it, the pads of
+        a grip of 10 N pressed 0.3 mm into a needle of 0.2 mm and shot it away.
         """
         return MASS * (self.radius / RADIUS) * (self.tip_angle / TIP_ANGLE)
 
@@ -85,7 +87,7 @@ OWN_SHAPE = NeedleShape()
 
 
 def point(angle: float, radius: float = RADIUS) -> NDArray[np.float64]:
-    """Return the point (3,) [m] at `angle` [rad] of an arc of `radius` [m] in its frame."""
+    """Return the point (3,) [m] at `angle` [rad] on an arc of `radius` [m] in its frame."""
     return np.array([-radius * math.cos(angle), radius * math.sin(angle), 0.0])
 
 
@@ -110,7 +112,7 @@ def polyline(
 
 
 def thickness(angle: float) -> float:
-    """Return half of the own needle's thickness [m] at `angle` [rad]; its last quarter tapers."""
+    """Return half of the scene needle's thickness [m] at `angle` [rad]; the last quarter tapers."""
     return OWN_SHAPE.thickness(angle)
 
 

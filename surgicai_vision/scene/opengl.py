@@ -1,6 +1,6 @@
-"""OpenGL without a display: one context a process, made on first use, freed at its end.
+"""OpenGL without a display: one context per process, made on first use, freed at its end.
 
-Software rendering runs in the calling thread ($LP_NUM_THREADS is put to 0): one process per core is
+Software rendering runs in the calling thread ($LP_NUM_THREADS is set to 0): one process per core is
 faster than one threaded process, and a forked child, which lacks its parent's threads, would wait
 for them for ever.
 """
@@ -45,7 +45,7 @@ def make_current() -> None:
     global _context
     if _context is None:
         os.environ["LP_NUM_THREADS"] = "0"
-        warnings.filterwarnings("ignore", module="glfw")  # what it warns of ends in `no_image`
+        warnings.filterwarnings("ignore", module="glfw")  # `no_image` reports what it warns of
         _context = _new_context()
         atexit.register(_close)  # after the backend's own handler, hence run before it
     _context.make_current()
@@ -61,13 +61,13 @@ def renderer_string() -> str:
     from OpenGL import GL  # only now: the backend's module has told PyOpenGL its platform
 
     name = GL.glGetString(GL.GL_RENDERER)
-    if name is None:  # a backend of windows, where none can be opened
+    if name is None:  # a windowing backend that can open no window
         raise no_image("it opens no window; is $DISPLAY set?")
     return str(name.decode())
 
 
 def before_closing(closer: Callable[[], None]) -> None:
-    """Have `closer` called at the end of the process, while the context is current."""
+    """Register `closer`, to be called at the end of the process while the context is current."""
     _closers.append(closer)
 
 
@@ -84,13 +84,13 @@ def _new_context() -> _Context:
 
 
 def _backend() -> str:
-    """Return what $MUJOCO_GL names; on Linux EGL where it names nothing."""
+    """Return what $MUJOCO_GL names, or else the platform's default (EGL on Linux)."""
     default = {"Linux": "egl", "Darwin": "cgl"}.get(platform.system(), "glfw")
     return os.environ.get("MUJOCO_GL", "").lower().strip() or default
 
 
 def no_image(reason: str) -> InputError:
-    """Return the error about a machine that draws no image, with the reason and what to do."""
+    """Return the error for a machine that cannot draw images: the reason and what to do."""
     return InputError(
         f"No image can be drawn: '{_backend()}' gives no OpenGL ({reason}). On Debian or "
         "Ubuntu run: sudo apt-get install --yes --no-install-recommends libegl1 libgl1 (Mesa; "
@@ -102,7 +102,7 @@ def no_image(reason: str) -> InputError:
 def _reason(error: Exception) -> str:
     """Return why a backend gives no context, in one sentence.
 
-    PyOpenGL leaves None in the place of a library that it cannot load.
+    PyOpenGL leaves None instead of a library that it cannot load.
     """
     if isinstance(error, AttributeError):
         return "its library is not on this machine"
@@ -110,7 +110,7 @@ def _reason(error: Exception) -> str:
 
 
 def check_opengl() -> None:
-    """Refuse a machine that draws no image, before the work that ends in images.
+    """Refuse a machine that cannot draw images, before the work that leads to images.
 
     Raises:
         InputError: no OpenGL on this machine; says what to install.
@@ -119,7 +119,7 @@ def check_opengl() -> None:
 
 
 def _close() -> None:
-    """Free everything while the backend still lives."""
+    """Free everything while the backend still exists."""
     global _context
     if _context is not None:
         _context.make_current()

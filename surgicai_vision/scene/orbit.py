@@ -1,4 +1,4 @@
-"""Orbit: a free camera about a point, which a person turns, shifts and draws nearer."""
+"""Orbit: a free camera around a point, which a person turns, shifts and zooms."""
 
 import dataclasses
 import math
@@ -21,8 +21,8 @@ class Orbit:
     """A free camera, in MuJoCo's terms.
 
     Attributes:
-        target: the point in world in the image's middle [m].
-        distance: from it [m].
+        target: the world point in the middle of the image [m].
+        distance: from that point [m].
         azimuth: direction of view about world z [deg]; 90 looks along +y.
         elevation: of the direction of view [deg]; -90 looks straight down.
     """
@@ -33,13 +33,13 @@ class Orbit:
     elevation: float = -42.0
 
     def turned(self, right: float, down: float) -> "Orbit":
-        """Return it after a drag that turns the scene to the right and down [deg]."""
+        """Return the camera after a drag that turns the scene to the right and down [deg]."""
         elevation = min(STEEPEST, max(-STEEPEST, self.elevation - down))
         azimuth = (self.azimuth - right + 180.0) % 360.0 - 180.0
         return dataclasses.replace(self, azimuth=azimuth, elevation=elevation)
 
     def shifted(self, right: float, down: float) -> "Orbit":
-        """Return it after a drag that shifts the scene [share of its distance]."""
+        """Return the camera after a drag that shifts the scene [share of its distance]."""
         azimuth = math.radians(self.azimuth)
         elevation = math.radians(self.elevation)
         sideways = (math.sin(azimuth), -math.cos(azimuth), 0.0)
@@ -55,7 +55,7 @@ class Orbit:
         return dataclasses.replace(self, target=(x, y, z))
 
     def zoomed(self, factor: float) -> "Orbit":
-        """Return it at `factor` times the distance."""
+        """Return the camera at `factor` times the distance."""
         distance = min(FARTHEST, max(NEAREST, self.distance * factor))
         return dataclasses.replace(self, distance=distance)
 

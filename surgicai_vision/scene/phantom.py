@@ -1,13 +1,13 @@
 """Phantom: a tissue pad with a ridge along y; the four hole pairs open on the ridge's two flanks.
 
-Only the walls are solid where the tissue has channels: each flank is a plate of `WALL` thickness
-with square openings, so the needle runs free inside the ridge, as in SurgicAI's phantom, whose
-holes hang on springs. The openings are wide for the same reason as there: the needle's arc meets
+In tissue with channels only the walls are solid: each flank is a plate of `WALL` thickness with
+square openings, so the needle runs freely inside the ridge, as in SurgicAI's phantom, whose holes
+are mounted on springs. The openings are wide for the same reason as there: the needle's arc meets
 them 21° off their axis. Soft tissue has no openings (`scene.tissue`).
 
 Tissue yields to steel: the jaws may dent the pad by `DENT` before they meet its firm layer, while
-the needle, a hundred times lighter, lies on its surface. Without it no jaw whose pads reach past
-the grasp point could take a needle that lies flat.
+the needle, a hundred times lighter, lies on its surface. Without the dent, jaws whose pads reach
+past the grasp point could not grasp a needle that lies flat.
 """
 
 import itertools
@@ -30,14 +30,14 @@ CREST = 0.0012
 """Radius of the ridge's rounded top [m]."""
 BEYOND = 0.006
 """How far the ridge extends beyond the first and the last hole pair [m]: not far, because the tools
-come along the wound and their wrists need the room."""
+approach along the wound and their wrists need the room."""
 
 TRAY_RIM = 0.007
 """How far the tray under the phantom extends beyond it [m]."""
 TRAY_HEIGHT = 0.012
 """Height of that tray [m]."""
 CLEARANCE = 0.002
-"""Between the phantom's underside and the table [m]; the phantom stands sunk into the tray."""
+"""Between the phantom's underside and the table [m]; the phantom is sunk into the tray."""
 TABLE = SURFACE - SIZE[2] - CLEARANCE
 """Height of the table's top [m]."""
 
@@ -48,10 +48,11 @@ CONTACT = {
     "solimp": [0.945, 0.9745, 0.00055, 0.5, 2.0],
     "priority": 1,
 }
-"""Friction of 0.4 between wet tissue and steel. By priority, because MuJoCo takes the larger
-friction of a pair, which is the 1.0 of needle and jaws; the impedance is the mean of theirs and
-MuJoCo's default, which MuJoCo would take at equal priority. With a time constant of 8 ms an arm
-that runs into the tissue strikes it with at most 14 N, with 4 ms 29 N (`benchmarks/press.py`)."""
+"""Friction of 0.4 between wet tissue and steel. It takes effect by priority, because MuJoCo would
+otherwise use the larger friction of a pair, the 1.0 of needle and jaws. The impedance is the mean
+of theirs and MuJoCo's default, which MuJoCo would use at equal priority. With a time constant of
+8 ms an arm that runs into the tissue strikes it with at most 14 N, with 4 ms 29 N
+(`benchmarks/press.py`)."""
 
 
 def add_phantom(
@@ -71,7 +72,7 @@ def add_phantom(
         needle: collision bits of what the needle and thread touch.
         arm: collision bits of what the instruments touch.
         ridge: collision bits of the ridge's flanks and crest.
-        is_solid: no holes: what the needle meets there is added by `scene.tissue`.
+        is_solid: no holes; `scene.tissue` adds what the needle meets there.
     """
     body = spec.worldbody.add_body(name="phantom")
     add_flank = _add_solid_flank if is_solid else _add_flank
@@ -102,7 +103,7 @@ def add_phantom(
 def add_table(spec: mujoco.MjSpec, bits: dict[str, int]) -> None:
     """Add the tray and the table below, where a needle that falls from the phantom rests.
 
-    They are solid for the needle and the thread alone: no instrument is meant to come so low.
+    They are solid only for the needle and the thread: no instrument is meant to come that low.
 
     Args:
         spec: the scene.
@@ -119,7 +120,7 @@ def add_table(spec: mujoco.MjSpec, bits: dict[str, int]) -> None:
 
 
 def piece_edges(pairs: tuple[HolePair, ...]) -> list[float]:
-    """Return the five y [m] that part the ridge into one piece a hole pair, falling."""
+    """Return the five y [m], descending, that divide the ridge into one piece per hole pair."""
     rows = [pair.entry.centre[1] for pair in pairs]
     between = [(first + second) / 2 for first, second in itertools.pairwise(rows)]
     return [rows[0] + BEYOND, *between, rows[-1] - BEYOND]
@@ -182,12 +183,12 @@ def add_plate(
     thickness: float,
     contact: dict[str, object],
 ) -> None:
-    """Add a box whose outer face is a rectangle of a hole's plane.
+    """Add a box whose outer face is a rectangle in a hole's plane.
 
     Args:
         body: the phantom.
         name: of the geom.
-        hole: says the plane.
+        hole: gives the plane.
         along: where the rectangle begins and ends, up the flank from the hole's centre [m].
         across: the same along the wound [m].
         thickness: of the box [m].

@@ -5,8 +5,8 @@ has one set of GPU objects inside it, shared by its `FrameRenderer`s and freed w
 them. Several contexts in one process corrupt each other's segmentation when an older one is
 collected late, and cost 50 ms each.
 
-On llvmpipe the time of a frame goes into shadows, multisampling and the triangles of capsules, in
-this order: quality "fast" has none of the first two and few of the third; "high" is for images that
+On llvmpipe a frame's time goes into shadows, multisampling and the triangles of capsules, in this
+order. Quality "fast" has none of the first two and few of the third; "high" is for images that
 people look at.
 """
 
@@ -33,14 +33,14 @@ from surgicai_vision.scene.visual import appearance
 __all__ = ["QUALITIES", "Frame", "FrameRenderer", "parts_of_geoms", "renderer_string"]
 
 Frame = NDArray[np.uint8 | np.float32]
-"""One modality of a view, (height, width, channels): uint8, of depth float32 [m]."""
+"""One modality of a view, (height, width, channels): uint8, or float32 [m] for depth."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What an image costs.
+    """What decides how much an image costs.
 
-    Multisampling, shadow map [pixel], triangles round and along a capsule, quads a face.
+    Multisampling, shadow map [pixel], triangles around and along a capsule, quads per face.
     """
 
     samples: int
@@ -62,16 +62,16 @@ class Following(Protocol):
     """Their ids."""
 
     def follow(self) -> tuple[int, ...]:
-        """Write the meshes of the present state into the model; return a version of each.
+        """Write the meshes of the current state into the model; return a version of each.
 
-        A mesh of the same version as before is not uploaded again.
+        A mesh whose version has not changed is not uploaded again.
         """
 
 
 class FrameRenderer:
     """Images of one model at one size. Close it, or use it as a context manager.
 
-    Use a renderer in the thread and the process that made it.
+    Use a renderer only in the thread and the process that made it.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class FrameRenderer:
             skin: meshes of the model that follow the state, if it has any.
 
         Raises:
-            UnknownName: another quality.
+            UnknownName: no such quality.
             InputError: a size outside 1..4096, or no OpenGL on this machine.
         """
         check_name("quality", quality, QUALITIES)
@@ -116,20 +116,20 @@ class FrameRenderer:
         modality: str = RGB,
         window: Window | None = None,
     ) -> Frame:
-        """Return one image of the state `data`, an array of its own.
+        """Return one image of the state `data`, as a new array.
 
         Args:
             data: a state that has been through `mj_forward`.
-            camera: name of a camera of the model, or a free one; the image of a crop is that of its
-                camera in a window.
+            camera: name of a camera of the model, or a free one; for the image of a crop, its
+                camera together with a window.
             modality: "rgb" → (H, W, 3) uint8; "depth" → (H, W, 1) float32 [m] along the camera's
-                axis, the far plane where nothing stands; "segmentation" → (H, W, 1) uint8, an index
-                of `names.PARTS`.
+                axis, the far plane where there is nothing; "segmentation" → (H, W, 1) uint8, an
+                index of `names.PARTS`.
             window: where the image lies in a larger one of which only this part is drawn.
 
         Raises:
-            UnknownName: another camera or modality; the message lists what exists.
-            InputError: a crop, or a window that is not within its whole image.
+            UnknownName: no such camera or modality; the message lists what exists.
+            InputError: the name of a crop, or a window that is not within its whole image.
         """
         return self.render_all(data, camera, (modality,), window)[modality]
 
@@ -157,7 +157,7 @@ class FrameRenderer:
         return target.draw(data, view, wanted, area, self._skin)
 
     def _area(self, window: Window | None) -> mujoco.MjrRect:
-        """Return where the whole image lies about what is drawn, OpenGL's rows going up."""
+        """Return where the whole image lies relative to what is drawn; OpenGL's rows run up."""
         if window is None:
             return mujoco.MjrRect(0, 0, self.width, self.height)
         right = window.left + self.width
@@ -187,7 +187,7 @@ class FrameRenderer:
             self.close()
 
     def _view(self, camera: str) -> mujoco.MjvCamera:
-        """Return MuJoCo's handle of a camera and keep it."""
+        """Return MuJoCo's handle for a camera and keep it."""
         if crop_of(camera) is not None:
             raise InputError(
                 f"'{camera}' is a crop, whose place depends on the arm's reported joints; take its "
@@ -201,7 +201,7 @@ class FrameRenderer:
 
 
 def _context(model: mujoco.MjModel) -> mujoco.MjrContext:
-    """Return MuJoCo's objects on the GPU; refuse where the current context draws nothing."""
+    """Return MuJoCo's GPU objects; refuse if the current context cannot draw."""
     try:
         return mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
     except mujoco.FatalError as error:
@@ -244,7 +244,7 @@ class _Target:
         """Return the wanted modalities from at most two passes.
 
         `area` is the viewport. One larger than the framebuffer is a crop: projection and pixels
-        are those of the whole, and what falls outside the framebuffer is not drawn.
+        are those of the whole image, and what falls outside the framebuffer is not drawn.
         """
         opengl.make_current()
         numbers = self.look.tolist()
@@ -257,7 +257,7 @@ class _Target:
                 if self.versions.get(mesh) != version:
                     mujoco.mjr_uploadMesh(self.model, self.context, mesh)
                     self.versions[mesh] = version
-        # Another target may have drawn since; without this its buffer would be drawn over and read.
+        # Another target may have drawn since; without this its buffer would be drawn on and read.
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self.model, data, self.option, None, view, everything, self.scene)
@@ -275,7 +275,7 @@ class _Target:
         return images
 
     def _draw_ids(self, area: mujoco.MjrRect) -> None:
-        """Draw each geom in the colour of its number; such a pass has the exact depth as well."""
+        """Draw each geom in the colour of its number; such a pass gives the exact depth as well."""
         flags = self.scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
         try:
@@ -285,7 +285,7 @@ class _Target:
         mujoco.mjr_readPixels(self.colours, self.depths, self.area, self.context)
 
     def _depth(self) -> NDArray[np.float32]:
-        """Return metres from the depth buffer: 1 at the near plane, 0 at the far plane."""
+        """Return metres from the depth buffer, which has 1 at the near plane and 0 at the far."""
         extent = self.model.stat.extent
         near = self.model.vis.map.znear * extent
         far = self.model.vis.map.zfar * extent
@@ -311,7 +311,7 @@ class _Target:
 def parts_of_geoms(model: mujoco.MjModel) -> NDArray[np.uint8]:
     """Return each geom's index in `names.PARTS`, (ngeom,).
 
-    The first of its bodies that is named after a part decides.
+    It is decided by the nearest body named after a part, from the geom's own up to the root.
     """
     found = np.zeros(model.ngeom, dtype=np.uint8)
     for geom in range(model.ngeom):
@@ -327,7 +327,7 @@ _targets: dict[tuple[int, int, int, str], _Target] = {}
 
 
 def _acquire(model: mujoco.MjModel, height: int, width: int, quality: str) -> _Target:
-    """Return the target for these arguments; `_release` it once."""
+    """Return the target for these arguments; the caller must `_release` it once."""
     key = (id(model), height, width, quality)
     if key not in _targets:
         opengl.make_current()
@@ -346,7 +346,7 @@ def _release(target: _Target) -> None:
 
 
 def _free_all() -> None:
-    """Free every target while OpenGL still lives."""
+    """Free every target while OpenGL still exists."""
     for target in tuple(_targets.values()):
         target.users = 1
         _release(target)
@@ -368,7 +368,7 @@ if hasattr(os, "register_at_fork"):
 def _visual_settings(
     model: mujoco.MjModel, quality: Quality, height: int, width: int
 ) -> Iterator[None]:
-    """Lend the model the settings that OpenGL objects are made from; they are read only then."""
+    """Set, for a while, the options that OpenGL objects are made from; they are read only then."""
     look = model.vis.quality
     screen = model.vis.global_
     settings = (

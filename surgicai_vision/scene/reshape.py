@@ -1,9 +1,9 @@
 """Reshape: a needle of another shape in a compiled model.
 
 `reshape_needle(source, model, shape)` writes into `model` what MuJoCo compiles for a needle of
-`shape`: the capsules that collide with their bounds, mass and inertia, the mesh that is drawn; and
-it moves along the arc what sits on the needle: sites, and the first body of the thread. A needle
-alone is compiled for this (2 ms), so the numbers are MuJoCo's own, whatever the shape.
+`shape`: the colliding capsules with their bounds, mass and inertia, and the mesh that is drawn. It
+also moves what sits on the needle along the arc: sites, and the first body of the thread. For this
+a needle alone is compiled (2 ms), so the numbers are MuJoCo's own, whatever the shape.
 """
 
 import functools
@@ -35,7 +35,7 @@ def _compiled(shape: NeedleShape) -> mujoco.MjModel:
 
 
 def reshape_needle(source: mujoco.MjModel, model: mujoco.MjModel, shape: NeedleShape) -> None:
-    """Give the needle of `model` another shape; MuJoCo's derived constants are the caller's.
+    """Give the needle of `model` another shape; the caller updates MuJoCo's derived constants.
 
     Args:
         source: the scene's own model, which is only read.
@@ -71,7 +71,7 @@ def _copy_geoms(alone: mujoco.MjModel, there: int, model: mujoco.MjModel, here: 
 
 
 def _copy_mesh(alone: mujoco.MjModel, model: mujoco.MjModel) -> None:
-    """Copy the drawn mesh; it has as many vertices whatever the shape."""
+    """Copy the drawn mesh; it has the same number of vertices whatever the shape."""
     there = alone.mesh("needle").id
     here = model.mesh("needle").id
     for name in OF_MESH:

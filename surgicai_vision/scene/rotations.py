@@ -1,6 +1,6 @@
 """Rotations: matrices, roll-pitch-yaw, rotation vectors, quaternions, and the angle between two.
 
-Conventions: `R = Rz(yaw) Ry(pitch) Rx(roll)` (fixed axes, facts of SurgicAI); quaternions are (w,
+Conventions: `R = Rz(yaw) Ry(pitch) Rx(roll)` (fixed axes, as in SurgicAI); quaternions are (w,
 x, y, z), as in MuJoCo, with w >= 0. Each function has one implementation in plain floats (`…_flat`:
 a matrix is a tuple of nine floats, row by row), because a control step that calls numpy on 3 × 3
 arrays is several times slower; the numpy functions wrap it.
@@ -19,9 +19,9 @@ Quaternion = tuple[float, float, float, float]
 Matrix = NDArray[np.float64]
 
 LARGEST_ROLL = nextafter(2.0 * pi, 0.0)
-"""[rad]; so that a roll is above -2π."""
+"""[rad]; its negative is the limit that keeps a roll above -2π."""
 GIMBAL = 1e-9
-"""Below this cosine of the pitch, roll and yaw turn about one axis and the yaw is put to 0."""
+"""Below this cosine of the pitch, roll and yaw turn about one axis and the yaw is set to 0."""
 
 
 def rpy_to_matrix_flat(roll: float, pitch: float, yaw: float) -> Flat9:
@@ -148,7 +148,7 @@ def multiply_flat(a: Sequence[float], b: Sequence[float]) -> Flat9:
 
 
 def transpose_flat(a: Flat9) -> Flat9:
-    """Return the transposed matrix, of a rotation its inverse."""
+    """Return the transposed matrix; for a rotation this is its inverse."""
     a0, a1, a2, a3, a4, a5, a6, a7, a8 = a
     return a0, a3, a6, a1, a4, a7, a2, a5, a8
 

@@ -1,8 +1,8 @@
 """Thread: a chain of capsules on ball joints, tied to the needle's base.
 
-Sources: 95 mm long and 0.372 mm thick in SurgicAI's scene (40 capsules). Fewer segments keep the
-length. Contact is frictionless, by priority over what it touches, and the joints carry an armature:
-with friction the solver ran eight times slower.
+Sources: 95 mm long and 0.372 mm thick in SurgicAI's scene (40 capsules). With fewer segments the
+length is the same. Contact is frictionless, with priority over what the thread touches, and the
+joints carry an armature: with friction the solver ran eight times slower.
 """
 
 import mujoco
@@ -15,8 +15,8 @@ DAMPING = 2e-7
 ARMATURE = 1e-8
 HELD_ARMATURE = 4e-8
 """[kg·m²] of a thread that soft tissue holds. A thread under tension swings faster the lighter it
-is; with 1e-8 a thread of 20 segments that was drawn taut through two stitches broke the physics
-off, with 4e-8 also one of 40 does not."""
+is. With 1e-8 a thread of 20 segments drawn taut through two stitches ended in a physics error; with
+4e-8 even one of 40 does not."""
 
 
 def add_thread(

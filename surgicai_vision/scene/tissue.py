@@ -1,21 +1,22 @@
-"""Soft tissue: what of it is part of the MuJoCo model, and the forces it resists with.
+"""Soft tissue: its part of the MuJoCo model, and the forces with which it resists.
 
 `add_soft_tissue` turns the phantom's ridge into tissue without holes that can be pierced anywhere.
-What happens during an episode, when the skin is pierced and what is held where, is
+What happens during an episode, when the skin is pierced and what is held where, is in
 `envs.tissue`. The elements:
 
-* Skin: on each flank a thick box that only the needle meets, `SKIN_STIFFNESS` soft. It gives way
-  before it is pierced. The jaws and the thread meet the flank as they do in tissue with channels.
+* Skin: on each flank a thick box that only the needle meets, with the stiffness `skin_stiffness`.
+  It gives way before it is pierced. The jaws and the thread meet the flank as they do in tissue
+  with channels.
 * Two carriers: weightless bodies on hinges through the centre of the needle's arc. The site on
   each is a point of the needle that can slide along the arc.
 * Two holds: `connect` equalities between a carrier's site and an anchor, a mocap body. Along the
-  arc the hinge is free but for its `frictionloss`, the friction of the needle's shaft; across it
-  the equality is the lateral spring of the tissue. Solved as constraints both are stable at 2 ms:
+  arc the hinge is free except for its `frictionloss`, the friction of the needle's shaft; across it
+  the equality is the lateral spring of the tissue. Solved as constraints, both are stable at 2 ms:
   an explicit spring of 0.5 N/mm on a needle of 0.2 g would not be.
 * Holds of the thread, `THREAD_HOLDS` of them: the same between a capsule of the thread and a
-  slider, which glides along the thread through its anchor; its `frictionloss` is the thread's.
-  Which capsule, and where on it, is rewritten as the thread goes through. The sliders of a bite's
-  entry and exit glide the same way: between them the thread has no slack.
+  slider. The slider glides along the thread through its anchor, and its `frictionloss` is the
+  thread's friction. Which capsule is held, and where on it, is updated as the thread goes through.
+  The sliders of a bite's entry and exit move together: between them the thread has no slack.
 
 Every force is a field of `TissueForces`; `docs/tissue.md` says what is known and what is chosen.
 """
@@ -33,15 +34,15 @@ THICKNESS = 0.0025
 """Thickness of the skin's boxes [m]: a box pushes a needle out of its nearest face, so it must be
 thicker than the dent at which the skin is pierced."""
 STIFFENING = 10.0
-"""How much stiffer the skin is when it is dented by all of its thickness."""
+"""How much stiffer the skin is when it is dented by its whole thickness."""
 LATE = 6.0
-"""How late a stiffness changes over its width: MuJoCo's power of solimp."""
+"""How late over its width a stiffness changes: the power in MuJoCo's solimp."""
 RESPONSE = 62500.0
-"""Stiffness of the reference acceleration of skin and holds [1/s²]: the 4 ms of the scene's other
-contacts. Anything light diverges above 1/dt² = 250,000."""
+"""Stiffness of the reference acceleration of skin and holds [1/s²], as for the 4 ms of the scene's
+other contacts. Anything light diverges above 1/dt² = 250,000."""
 FRICTION_SOLREF = (0.004, 1.0)
 FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Of the shaft's friction. With MuJoCo's default it creeps, and holds 0.15 N in place of 0.62 N."""
+"""For the shaft's friction. With MuJoCo's default it creeps, and holds 0.15 N instead of 0.62 N."""
 CARRIER_MASS = 1e-6
 """[kg]; the two weigh 1 % of the needle."""
 CARRIER_ARMATURE = 1e-7
@@ -51,30 +52,31 @@ CARRIER_DAMPING = 2e-7
 THREAD_HOLDS = 4
 """Places that can hold the thread: entry and exit of the last two bites."""
 THREAD_STIFFNESS = 200.0
-"""Across the thread, at each place that holds it [N/m]."""
+"""Stiffness across the thread, at each place that holds it [N/m]."""
 THREAD_REACH = 0.0083
 THREAD_SOFTENING = 0.2
-"""From this distance on [m] the hold is softer by this factor: up to 8 mm it pulls with 0.4 N at
-most, as 2 ms can resolve. With 500 N/m and 0.8 N four of 150 random episodes at 75 mm/s broke off,
-with these none of 300."""
+"""From this distance on [m] the hold is softer by this factor: up to 8 mm it pulls with at most
+0.4 N, which 2 ms can resolve. With 500 N/m and 0.8 N, four of 150 random episodes at 75 mm/s ended
+in a physics error; with these values none of 300."""
 SLIDER_ARMATURE = 1e-3
-"""[kg]: as inert as 2 ms can resolve; at 25 mm/s it takes a hundredth of the friction to move."""
+"""[kg]: inert enough for 2 ms to resolve; moving it at 25 mm/s takes a hundredth of the
+friction."""
 HIDDEN = (0.0, 0.0, -0.1)
-"""Where anchors stay that hold nothing [m, world]."""
+"""Where anchors that hold nothing are kept [m, world]."""
 Spring = tuple[tuple[float, float], tuple[float, float, float, float, float]]
 """solref and solimp of a constraint."""
 SOFT_DATA = 520
-"""Numbers that `envs.tissue` keeps inside MuJoCo's state."""
+"""How many numbers `envs.tissue` keeps inside MuJoCo's state."""
 
 
 @dataclass(frozen=True)
 class TissueForces:
     """How tissue resists a suture needle and its thread.
 
-    The parts are those that Okamura, Simone and O'Leary (IEEE Transactions on Biomedical
+    The components are those that Okamura, Simone and O'Leary (IEEE Transactions on Biomedical
     Engineering 51:1707, 2004) found in needle insertions: stiffness before the puncture, then
-    friction in proportion to the depth, and a constant cutting force. Across the shaft they are
-    those of Jackson and Çavuşoğlu (ICRA 2012): tissue that a needle off its own arc compresses.
+    friction proportional to the depth, and a constant cutting force. Across the shaft they are
+    those of Jackson and Çavuşoğlu (ICRA 2012): a needle off its own arc compresses the tissue.
     None depends on the speed (Frick et al., Journal of Biomechanics 34:1335, 2001: 1 to 10 mm/s).
 
     Attributes:
@@ -82,11 +84,11 @@ class TissueForces:
         skin_friction: coefficient of friction between needle and skin.
         puncture_in: force on the tip at which the skin is pierced [N].
         puncture_out: the same from inside, where the tip leaves [N].
-        cutting: force on a tip that cuts its way [N].
+        cutting: force on the tip while it cuts through tissue [N].
         friction: force along the shaft per embedded length [N/m].
         lateral_stiffness: force across the shaft per displacement, at each place that holds [N/m].
-        yield_force: force across the shaft beyond which a part of the displacement stays [N].
-        hardening: by how much that force grows per displacement that stayed [N/m].
+        yield_force: force across the shaft beyond which part of the displacement is permanent [N].
+        hardening: by how much that force grows per permanent displacement [N/m].
         tear_force: force across the shaft at which the tissue tears, down to `yield_force` [N].
         thread_friction: force along the thread per length of the bite [N/m].
     """
@@ -119,10 +121,10 @@ class TissueForces:
 
         Args:
             distance: of what is held from its anchor [m].
-            yielded: displacement of the anchor that stayed so far [m].
+            yielded: permanent displacement of the anchor so far [m].
 
         Returns:
-            The share of `distance` by which the anchor moves, the displacement that has stayed then
+            The share of `distance` by which the anchor moves, the permanent displacement after that
             [m], and whether the tissue tore.
         """
         force = self.lateral_stiffness * distance
@@ -181,14 +183,14 @@ FORCES = MappingProxyType(
 """Preset → forces. No publication gives all of them for a needle of 0.9 mm, so most are chosen:
 
 * "phantom": ours, a training phantom that is firmer than tissue. The curve over depth has the two
-  peaks, at the way in and at the way out, that Frick et al. measured in sheepskin.
+  peaks, on the way in and on the way out, that Frick et al. measured in sheepskin.
 * "skin": `puncture_in` is the largest mean of Maloney et al. (Dermatologic Surgery, 2021: 0.48 to
   1.00 N, tapered and cutting needles of 3-0 to 5-0 in human abdominal skin); `yield_force` is the
   largest force with which a stitch closed a wound (Capek et al., Medical & Biological Engineering &
-  Computing 50:193, 2012: 1.1 to 3.2 N), which skin must bear. The share of cutting to friction over
+  Computing 50:193, 2012: 1.1 to 3.2 N), which skin must bear. The ratio of cutting to friction over
   a bite of 8 mm is ours: for hollow needles Barnett et al. (Journal of Manufacturing Science and
   Engineering, 2015) give 61 % to tearing, 18 % to spreading, 21 % to friction. The rest is ours.
-* "liver": ours, softer than skin throughout, in the order of Okamura's bovine liver.
+* "liver": ours, softer than skin throughout, of the order of Okamura's bovine liver.
 """
 
 
@@ -266,7 +268,7 @@ def _add_carrier(spec: mujoco.MjSpec, index: int) -> None:
 
 
 def _add_anchor(spec: mujoco.MjSpec, name: str) -> mujoco.MjsBody:
-    """Add an anchor, which is put where something is held."""
+    """Add an anchor, which is placed where something is held."""
     return spec.worldbody.add_body(name=name, mocap=True, pos=list(HIDDEN))
 
 
@@ -290,7 +292,7 @@ def _add_slider(anchor: mujoco.MjsBody, index: int) -> str:
 
 
 def _couple_sliders(spec: mujoco.MjSpec, index: int) -> None:
-    """Add an inactive equality: a slider and the next one glide the same way."""
+    """Add an inactive equality that makes a slider and the next one move together."""
     equality = spec.add_equality(name=f"thread_bite_{index}", type=mujoco.mjtEq.mjEQ_JOINT)
     equality.name1 = f"thread_slider_{index}"
     equality.name2 = f"thread_slider_{index + 1}"
@@ -308,11 +310,11 @@ def _add_hold(spec: mujoco.MjSpec, name: str, kind: mujoco.mjtObj, held: str, by
 
 
 def spring(stiffness: float, inverse_mass: float) -> Spring:
-    """Return solref and solimp of a constraint that is a spring of `stiffness` [N/m] at rest.
+    """Return solref and solimp of a constraint that acts as a spring of `stiffness` [N/m] at rest.
 
     MuJoCo's force at rest is K' d² r / ((1 - d) A) with the impedance d, the reference stiffness K'
-    and the inverse mass A that it takes for the pair. K' d is `RESPONSE` here, damped critically;
-    d follows.
+    and the inverse mass A that it uses for the pair. Here K' d is `RESPONSE`, critically damped;
+    d follows from that.
 
     Args:
         stiffness: static stiffness [N/m].
@@ -327,11 +329,11 @@ def spring(stiffness: float, inverse_mass: float) -> Spring:
 def graded_spring(stiffness: float, factor: float, width: float, inverse_mass: float) -> Spring:
     """Return solref and solimp of a spring whose stiffness has changed by `factor` at `width`.
 
-    Up to a third of the width it is as asked for.
+    Up to a third of the width it is as requested.
 
     Args:
         stiffness: static stiffness near 0 [N/m].
-        factor: by which it differs from `width` on.
+        factor: by which it differs at `width` and beyond.
         width: [m].
         inverse_mass: as for `spring`.
     """
@@ -346,8 +348,8 @@ def graded_spring(stiffness: float, factor: float, width: float, inverse_mass: f
 def skin_spring(stiffness: float, inverse_mass: float) -> Spring:
     """Return solref and solimp of skin, which stiffens towards its thickness.
 
-    At all of it the skin is stiffer than the arms can press: nothing but a tip that pierces gets
-    through.
+    At its full thickness the skin is stiffer than the arms can press: only a tip that pierces it
+    gets through.
     """
     return graded_spring(stiffness, STIFFENING, THICKNESS, inverse_mass)
 

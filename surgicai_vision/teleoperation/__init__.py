@@ -1,4 +1,4 @@
-"""Teleoperation: a person drives the active arm; what succeeded is kept as demonstrations.
+"""Teleoperation: a person drives the active arm; successful episodes are kept as demonstrations.
 
     keys, sticks ──poll──► Input ──InputMapping──► action (7,) ──Session.tick──► env ──► Recordings
        web page ◄───────────────── images and status ◄──────────────┘
@@ -12,12 +12,13 @@ The parts, each usable and tested alone:
   `--help`, the page and the documentation show is in `keyboard`. Keys are named as browsers name
   them (`KeyboardEvent.code`): by their place on the keyboard, whatever is printed on them.
 * `session`: the state machine waiting → driving → judged → kept or discarded. Stepped by `tick`,
-  one control step of 20 ms each; no clock, no thread, no randomness but the episode's seed: the
-  same inputs give the same files.
+  one control step of 20 ms each. It has no clock, no thread and no randomness except the episode's
+  seed: the same inputs give the same files.
 * `recordings`: the folder. An episode is written whole as soon as it is kept, so a process killed
-  at any moment costs the attempt under way; the same command continues the numbers and the seeds.
-* `pacer`, `loop`: ticks at 50 Hz of the wall clock. When rendering is too slow, images are dropped,
-  never ticks.
+  at any moment loses only the attempt under way. The same command then continues the numbers and
+  the seeds.
+* `core.pacer`, `loop`: ticks at 50 Hz of the wall clock. When rendering is too slow, images are
+  dropped, never ticks.
 * `web`: the page on which a person sees and acts; a `Device` and a `Screen` (`loop`).
 
 The page's server listens on loopback only, its address holds a random token, and a gamepad on the

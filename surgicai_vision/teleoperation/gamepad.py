@@ -14,7 +14,7 @@ BUTTONS = 16
 DEAD_ZONE = 0.12
 """Deflection below which a stick is at rest; worn sticks stay up to a tenth off."""
 PRESSED = 0.5
-"""Value from which on a button is pressed."""
+"""Value from which a button counts as pressed."""
 _X, _LB, _RB, _LT, _RT, _UP, _DOWN = 2, 4, 5, 6, 7, 12, 13
 PRESSES = MappingProxyType({0: JAW, 3: VIEW, 8: STOP, 9: START, 14: DISCARD, 15: KEEP})
 """Button → event."""
@@ -29,7 +29,7 @@ class Gamepad:
         self._events: list[str] = []
 
     def update(self, axes: Sequence[float], buttons: Sequence[float]) -> None:
-        """Take over the present state; what shorter lists leave out is at rest."""
+        """Take over the current state; whatever shorter lists leave out is at rest."""
         self._axes = _filled(axes, AXES)
         before = self._buttons
         self._buttons = _filled(buttons, BUTTONS)
@@ -42,7 +42,7 @@ class Gamepad:
         self.update((), ())
 
     def poll(self) -> Input:
-        """Return the present deflections, and the buttons pressed since the last call."""
+        """Return the current deflections, and the buttons pressed since the last call."""
         x, y, right_x, right_y = map(curve, self._axes)
         button = self._buttons
         events = tuple(self._events)

@@ -12,10 +12,10 @@ from surgicai_vision.teleoperation.inputs import JAW, Input, Vector
 
 FRAMES = ("camera", "tool")
 FINE = 0.2
-"""Speed with the fine modifier, as a share of the usual."""
+"""Speed with the fine modifier, as a share of the usual speed."""
 CLOSE_ABOVE = 0.05
 OPENED = 0.4
-"""The toggle closes a jaw that is open by more than the first, and opens others to the second
+"""The toggle closes a jaw that is open by more than the first, and opens any other to the second
 [rad]: enough for the needle (0.7 mm) and little else between the pads."""
 
 

@@ -1,9 +1,9 @@
 """Inputs: what a person can command at one moment, and the protocol of an input device.
 
-Axes are those of an image, as OpenCV has them: x right, y down, z away from the viewer, into the
-image. A turn is about these axes by the right-hand rule: about x it tilts what points away upwards,
-about y it swings it to the right, about z it rolls clockwise. In the tool's frame the view is along
-the instrument: z points out between the jaws.
+Axes are those of an image, as in OpenCV: x right, y down, z away from the viewer, into the image.
+Turns about these axes follow the right-hand rule: for a tool that points away, a turn about x tilts
+it upwards, one about y swings it to the right, and one about z rolls it clockwise. In the tool's
+frame the view is along the instrument: z points out between the jaws.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ START = "start"
 JAW = "jaw"
 VIEW = "view"
 EVENTS = (KEEP, DISCARD, STOP, START, JAW, VIEW)
-"""What happens once a press: → ← Esc as in `lerobot-record`, start, open or close the jaw, lead
+"""What happens once per press: → ← Esc as in `lerobot-record`, start, open or close the jaw, lead
 with the next view."""
 
 
@@ -32,7 +32,7 @@ class Input:
         turn: about x, y, z of the frame, each in [-1, 1].
         jaw: opening (1) or closing (-1).
         fine: the fine modifier is held.
-        events: what was pressed since the last input, of `EVENTS`, in order.
+        events: which of `EVENTS` were pressed since the last input, in order.
     """
 
     move: Vector = (0.0, 0.0, 0.0)
@@ -51,11 +51,11 @@ class Device(Protocol):
     """A source of inputs."""
 
     def poll(self) -> Input:
-        """Return the present input; each event is returned once."""
+        """Return the current input; each event is returned once."""
 
 
 def merge(inputs: Iterable[Input]) -> Input:
-    """Return several inputs as one: motions are added up to at most 1, events are concatenated."""
+    """Return several inputs as one: motions are added and limited to 1, events concatenated."""
     sums = [0.0] * 7
     fine = False
     events: list[str] = []

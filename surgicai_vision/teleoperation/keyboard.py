@@ -78,7 +78,7 @@ PRESSES = MappingProxyType(
     }
 )
 CODES = frozenset((*MOTIONS, *FINE_KEYS, *PRESSES))
-"""Every key that means something."""
+"""Every key that has a meaning."""
 _NAMES = MappingProxyType(
     {
         "ArrowRight": "→",

@@ -26,7 +26,7 @@ class Views(Protocol):
     """Renders what a session's views show."""
 
     def render(self) -> Images:
-        """Return the present image of every view."""
+        """Return the current image of every view."""
 
 
 class EnvViews:
@@ -44,7 +44,7 @@ class EnvViews:
         self._size = (size, size)
 
     def render(self) -> Images:
-        """Return the present image of every view."""
+        """Return the current image of every view."""
         return {
             camera: self._env.image(camera, self._size).astype(np.uint8, copy=False)
             for camera in self._cameras

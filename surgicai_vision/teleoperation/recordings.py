@@ -1,9 +1,9 @@
-"""Recordings: the folder that teleoperation fills, an episode at a time.
+"""Recordings: the folder that teleoperation fills, one episode at a time.
 
-A folder of demonstrations like any other (`demos.store`), complete after every episode.
-`demos.json` also says which seeds were kept and which were given up; an episode whose entry a kill
-prevented is found by its file. The folder is locked while a session runs, so that two cannot write
-the same numbers.
+It is a folder of demonstrations like any other (`demos.store`), complete after every episode.
+`demos.json` also says which seeds were kept and which were given up. If the process was killed
+before it could enter an episode there, the episode is found by its file. The folder is locked while
+a session runs, so that two cannot write the same numbers.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,7 +35,7 @@ class Recordings:
     Args:
         folder: the folder.
         request: what the folder is for; kept in its marker.
-        seeds: those of the episodes in the folder, in their order.
+        seeds: of the episodes in the folder, in their order.
         skipped: seeds given up, {"seed", "reason"}.
     """
 
@@ -83,16 +83,16 @@ class Recordings:
 def open_recordings(
     folder: Path, config: TaskConfig, scene_hash: str, seed: int | None = None
 ) -> Iterator[Recordings]:
-    """Open a folder to add episodes to, and keep others out of it meanwhile.
+    """Open a folder to add episodes to, and lock out other sessions meanwhile.
 
     Args:
-        folder: made if it does not exist; removed again if nothing came into it.
-        config: the task; a folder holds one.
+        folder: created if it does not exist; removed again if nothing was written to it.
+        config: the task; a folder holds a single one.
         scene_hash: hash of the compiled scene.
         seed: first seed of a new folder, 0 by default; an existing one is continued.
 
     Raises:
-        InputError: the start is kept for validation or tests.
+        InputError: the start is reserved for validation or tests.
         OutputExists: the folder holds something else.
         SurgicaiError: another session has it open.
         BadFile: damaged episodes or marker.

@@ -1,13 +1,13 @@
-"""Session: the state machine of teleoperation, one control step a tick.
+"""Session: the state machine of teleoperation, one control step per tick.
 
     waiting ──moves, Enter──► driving ──ended──► judged ──→──► kept, next start
        └──────────◄── ← (same start) ◄──┴────◄─────┘
 
-→ keeps an episode that succeeded and goes on to the next start. Where there is no success yet it
+→ keeps an episode that succeeded and goes on to the next start. If there is no success yet, it
 gives the start up: in `waiting` at once, in `driving` after the episode was judged a failure. ←
-discards and goes back to the same start. Esc stops; a success that waits for its answer is kept. An
-episode starts when nothing was held and something moves, so a key still held from the last one does
-not start the next.
+discards and goes back to the same start. Esc stops; a success that waits for an answer is kept. An
+episode starts when something moves after nothing was held, so a key still held from the last one
+does not start the next.
 
 A session has no clock: the same inputs give the same files.
 """
@@ -32,7 +32,7 @@ class Rules:
     """What a session does without asking.
 
     Attributes:
-        episodes: stop when so many more were kept; None goes on until Esc.
+        episodes: stop when this many more were kept; None goes on until Esc.
         auto_keep: keep a success without asking.
         keep_failures: → keeps episodes without success too.
         skip_idle: the world stands still while nothing is held.
@@ -51,9 +51,9 @@ class Status:
     Attributes:
         state: "waiting", "driving", "judged" or "stopped".
         message: what happened and what to do, one line.
-        success: whether the present episode succeeded, once judged.
+        success: whether the current episode succeeded, once judged.
         episode: number that the next kept episode gets.
-        seed: seed of the present start.
+        seed: seed of the current start.
         kept, discarded, skipped: counts in this session.
         steps, limit: control steps of the attempt, and how many it may take.
         subtask, arm: the subtask under way, and its arm.
@@ -160,7 +160,7 @@ class Session:
             self._drive(user_input)
 
     def _handle(self, event: str) -> None:
-        """Handle an event in the present state."""
+        """Handle an event in the current state."""
         if event == VIEW:
             self._leading = (self._leading + 1) % len(self._views)
         elif event == STOP:
@@ -215,7 +215,7 @@ class Session:
                 self._keep()
 
     def _judge(self, reason: str) -> None:
-        """End the attempt, which without success ended for `reason`."""
+        """End the attempt; `reason` says why it ended if it did not succeed."""
         self._state = JUDGED
         if self._attempt.success:
             self._message = "Success. → keeps it, ← does it again."

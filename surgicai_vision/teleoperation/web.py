@@ -1,7 +1,7 @@
 """Web: the page that shows the images and takes a browser's keys, touches and gamepads.
 
-`core.web` serves it: `POST input` is what is held and what was pressed (`PageInputs.receive`). The
-keys of a browser that is silent for half a second count as released.
+`core.web` serves it: `POST input` carries what is held and what was pressed (`PageInputs.receive`).
+The keys of a browser that is silent for half a second count as released.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from surgicai_vision.teleoperation.keyboard import TABLE, Keyboard, key_names
 SILENCE_S = 0.5
 """Time without a message after which a browser's keys count as released [s]."""
 MAX_PAGES = 8
-"""Pages open at the same time whose inputs count."""
+"""How many pages open at the same time have inputs that count."""
 FOLDER = Path(__file__).parent / "page"
 
 
@@ -43,7 +43,7 @@ class _Page:
 
 @dataclasses.dataclass(frozen=True)
 class _Message:
-    """What a page sends: its keys, its gamepad, and a number that grows."""
+    """What a page sends: its keys, its gamepad, and an increasing number."""
 
     client: str
     number: int
@@ -70,8 +70,8 @@ class PageInputs:
 
         Args:
             content: {"client": str, "number": int, "held": [code], "pressed": [code], "axes":
-                [float], "buttons": [float]}; "pressed" went down since the message before. Older
-                numbers are ignored.
+                [float], "buttons": [float]}; "pressed" keys went down since the previous message.
+                Older numbers are ignored.
 
         Raises:
             InputError: anything else.
@@ -90,7 +90,7 @@ class PageInputs:
             page.gamepad.update(message.axes, message.buttons)
 
     def poll(self) -> Input:
-        """Return the present input of all pages."""
+        """Return the current input of all pages."""
         with self._lock:
             for page in self._pages.values():
                 if self._clock() - page.received > SILENCE_S:
@@ -137,7 +137,7 @@ class WebView(ScreenPage):
     Args:
         views: the cameras shown.
         title: what the page is about.
-        port: to listen at; 0 takes any.
+        port: to listen on; 0 takes any.
 
     Raises:
         InputError: the port is not free.

@@ -1,1 +1,1 @@
-"""Training: features and actions become a policy."""
+"""Training: from features and actions to a policy."""

@@ -1,13 +1,13 @@
-"""Augmentation: what is done to normalised inputs in training, and never when a policy acts.
+"""Augmentation of normalised inputs, applied only in training and never when a policy acts.
 
 * `with_noise(observed, inputs, deviation)`: Gaussian noise on the measured poses (the recipe's
-  `proprioception_noise`), so that a policy does not trust the joints further than they can be
-  trusted. What stands beside them (`EXACT`) stays as it is.
-* `with_shift(observed, shapes, places)`: feature maps moved by whole places (the recipe's
-  `map_shift`), as where a crop lies beside the jaws; DrQ moves images so (Kostrikov et al., Image
-  augmentation is all you need, ICLR 2021).
+  `proprioception_noise`), so that a policy does not rely on the joints beyond their accuracy. The
+  other inputs (`EXACT`) stay unchanged.
+* `with_shift(observed, shapes, places)`: feature maps shifted by whole places (the recipe's
+  `map_shift`), as if a crop missed the jaws; DrQ shifts images in the same way (Kostrikov et al.,
+  Image augmentation is all you need, ICLR 2021).
 
-Both draw from torch's own random state, which `train` seeds, stores and restores.
+Both draw from torch's global random state, which `train` seeds, stores and restores.
 """
 
 import math
@@ -19,15 +19,15 @@ from policies.base import VECTORS, Inputs
 from surgicai_vision.core import names
 
 EXACT = (names.SETPOINT, names.CLOCK, names.PROGRESS)
-"""What is fed beside features and is not off where the joints are."""
+"""Inputs fed alongside the features that errors of the joints do not affect."""
 
 
 def with_noise(observed: torch.Tensor, inputs: Inputs, deviation: float) -> torch.Tensor:
-    """Add noise to the measured poses, whatever else is fed left as it is.
+    """Add noise to the measured poses and leave all other inputs unchanged.
 
     Args:
         observed: (B, inputs.dim) normalised inputs, the views' features first.
-        inputs: what they are.
+        inputs: the layout of these inputs.
         deviation: standard deviation of the noise, in standard deviations of each value.
     """
     noisy = observed.clone()
@@ -44,17 +44,17 @@ def with_noise(observed: torch.Tensor, inputs: Inputs, deviation: float) -> torc
 def with_shift(
     observed: torch.Tensor, shapes: Sequence[tuple[int, ...]], places: int, moments: int = 1
 ) -> torch.Tensor:
-    """Move every feature map by up to `places` places each way, each by a draw of its own.
+    """Shift every feature map by up to `places` places each way, each by its own random draw.
 
-    What comes in from outside is the channel's mean, which is 0 in normalised inputs. The moments
-    of a history move together: what a camera is off by does not change from one to the next, and
-    the way the needle has gone between them is what a history is there to show.
+    Places from outside the map get the channel's mean, which is 0 in normalised inputs. The moments
+    of a history shift together: a camera's offset does not change from one to the next, and a
+    history must still show how the needle moved between them.
 
     Args:
         observed: (B, inputs.dim) normalised inputs, the views' features first.
-        shapes: of the features, in their order; only maps (C, h, w) are moved.
-        places: largest move [places].
-        moments: rows one after the other that are one history; B is a multiple of it.
+        shapes: shapes of the features, in order; only maps (C, h, w) are shifted.
+        places: largest shift [places].
+        moments: consecutive rows that form one history; B is a multiple of it.
     """
     moved = torch.zeros_like(observed)
     at = 0
@@ -76,7 +76,7 @@ def with_shift(
 
 
 def _overlap(move: int, length: int) -> tuple[slice, slice]:
-    """Return where an axis that is moved lands, and what of it does."""
+    """Return the target and the source slice of an axis that is shifted."""
     low = max(move, 0)
     high = length + min(move, 0)
     return slice(low, high), slice(low - move, high - move)

@@ -1,4 +1,4 @@
-"""A moving average of a policy's weights in training, which is what is kept.
+"""A moving average of a policy's weights in training; the average is what is kept.
 
 The decay grows with the number of updates as in Diffusion Policy's code (Chi et al., RSS 2023,
 `diffusion_policy/model/diffusion/ema_model.py`): 1 - (1 + n)^-0.75, up to the recipe's `ema`.
@@ -23,7 +23,7 @@ class MovingAverage:
     """The moving average of a module's parameters; buffers are the module's own.
 
     Args:
-        module: what is trained.
+        module: the module that is trained.
         decay: the largest decay, from 0 to below 1.
     """
 
@@ -34,7 +34,7 @@ class MovingAverage:
 
     @torch.no_grad()
     def update(self, module: nn.Module) -> None:
-        """Take in the weights after one update."""
+        """Add the weights after one update to the average."""
         self._updates += 1
         decay = min(self._decay, 1 - (1 + self._updates) ** -POWER)
         for name, value in module.named_parameters():
@@ -42,7 +42,7 @@ class MovingAverage:
 
     @contextmanager
     def applied(self, module: nn.Module) -> Iterator[None]:
-        """Let the module have the averaged weights for a while."""
+        """Give the module the averaged weights within a `with` block."""
         own = {name: value.detach().clone() for name, value in module.named_parameters()}
         _fill(module, self._mean)
         try:
@@ -55,7 +55,7 @@ class MovingAverage:
         return {"updates": self._updates, "mean": self._mean}
 
     def restore(self, updates: int, mean: dict[str, torch.Tensor]) -> None:
-        """Go on from a state."""
+        """Continue from a state."""
         self._updates = updates
         for name, value in mean.items():
             self._mean[name].copy_(value)

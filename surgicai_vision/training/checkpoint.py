@@ -1,15 +1,15 @@
-"""A checkpoint: what a training leaves behind, verified whenever it is read.
+"""A checkpoint: the result of a training, verified whenever it is read.
 
 Interface:
 
-* `Checkpoint`: everything about a trained policy, frozen, with the folder it lies in.
+* `Checkpoint`: everything about a trained policy, frozen, with its folder.
 * `write_checkpoint(folder, checkpoint, tensors)`: `policy.safetensors` first, `checkpoint.json`
   last.
-* `read_checkpoint(folder) -> Checkpoint`: refuse in one line what is missing, damaged, tampered
-  with or of another format.
-* `read_tensors(checkpoint)`: the policy's weights and input statistics, hash checked.
-* `check_encoder(checkpoint, encoder)`, `check_task(checkpoint, task)`: refuse what the policy was
-  not trained on.
+* `read_checkpoint(folder) -> Checkpoint`: refuse, in one line, one that is missing, damaged,
+  tampered with or of another format.
+* `read_tensors(checkpoint)`: the policy's weights and input statistics, with their hash checked.
+* `check_encoder(checkpoint, encoder)`, `check_task(checkpoint, task)`: refuse an encoder or a task
+  that the policy was not trained on.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 FORMAT = 2
 CARD = "checkpoint.json"
 REQUEST = "training.json"
-"""Marks the folder of a training that was begun; written first."""
+"""Marks the folder of a training that has begun; written first."""
 WEIGHTS = "policy.safetensors"
 PREPROCESSING = ("input_size", "input_range", "mean", "std", "interpolation", "channel_order")
 """Entries of a card that change what the network sees."""
@@ -47,8 +47,8 @@ class EncoderRecord:
         name: its registered name.
         card: its card as plain data.
         weights_sha256: hash of its weights and buffers.
-        pool: what was taken from it.
-        fingerprint: hash of all its features depend on, compute type included.
+        pool: which of its outputs was used.
+        fingerprint: hash of everything its features depend on, compute type included.
         shape: shape of one feature before it is flattened.
     """
 
@@ -65,12 +65,12 @@ class StageErrors:
     """What a high-level policy got right and wrong on held-out frames.
 
     Attributes:
-        confusion: frames, by the subtask that was due (row) and the one it named (column), both in
+        confusion: frames, by the subtask that was due (row) and the predicted one (column), both in
             the order of `names.SUBTASKS`.
-        calibration_error: mean distance between the probability of what it named and how often
-            that was right, in [0, 1] (expected calibration error).
-        progress_error: mean absolute error of the progress, in [0, 1]; None for a policy that says
-            none.
+        calibration_error: mean difference between the probability of the predicted subtask and how
+            often it was right, in [0, 1] (expected calibration error).
+        progress_error: mean absolute error of the progress, in [0, 1]; None for a policy that does
+            not predict it.
     """
 
     confusion: tuple[tuple[int, ...], ...]
@@ -79,12 +79,12 @@ class StageErrors:
 
     @property
     def frames(self) -> int:
-        """Frames counted."""
+        """Number of frames evaluated."""
         return sum(map(sum, self.confusion))
 
     @property
     def right(self) -> int:
-        """Frames whose subtask it named."""
+        """Number of frames whose subtask was predicted correctly."""
         return sum(row[index] for index, row in enumerate(self.confusion))
 
 
@@ -104,14 +104,14 @@ class Checkpoint:
         validation_episodes: indices of the episodes held out.
         train_losses: mean training loss of each epoch.
         validation_losses: validation loss after each epoch; empty where nothing was held out.
-        device: what it was trained on.
+        device: the device it was trained on.
         code_version: version of this package.
         policy_sha256: hash of `policy.safetensors`.
-        stage_errors: a high-level policy's errors on the episodes held out; None for another
+        stage_errors: a high-level policy's errors on the episodes held out; None for any other
             policy, or where nothing was held out.
         progress_sha256: hash of the weights of the policy whose progress it is fed; "" for none.
         format: version of this file's layout.
-        folder: where it lies (not stored).
+        folder: its folder (not stored).
     """
 
     run: RunConfig
@@ -157,7 +157,7 @@ class Checkpoint:
 def write_checkpoint(
     folder: Path, checkpoint: Checkpoint, tensors: "Mapping[str, torch.Tensor]"
 ) -> Checkpoint:
-    """Write weights, then card; return the checkpoint as it now lies in `folder`."""
+    """Write weights, then card; return the checkpoint as stored in `folder`."""
     from safetensors.torch import save
 
     content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
@@ -212,7 +212,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 def read_tensors(checkpoint: Checkpoint) -> "dict[str, torch.Tensor]":
-    """Return the policy's tensors after checking their hash; `BadFile` where it does not fit."""
+    """Return the policy's tensors after checking their hash; `BadFile` if it does not match."""
     from safetensors.torch import load
 
     path = checkpoint.folder / WEIGHTS
@@ -234,7 +234,7 @@ def check_encoder(checkpoint: Checkpoint, encoder: "Encoder | None") -> None:
     """Refuse an encoder whose weights, preprocessing or pool differ from those trained on.
 
     Raises:
-        InputError: it differs; the message says in what.
+        InputError: it differs; the message says how.
     """
     wanted = checkpoint.encoder
     if wanted is None or encoder is None:

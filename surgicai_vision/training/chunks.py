@@ -4,13 +4,13 @@
     dataset = with_chunks(with_frame_stride(whole, 5), timeline, range(0, 25))
     dataset.columns()[names.ACTION_CHUNK]       # (N, 25, 8) float32
 
-The last of the eight values is 1 where the demonstration holds no such step: there the nearest step
-it holds stands, as in LeRobot's `action_is_pad`. A chunk ends with its episode and, in a whole
-procedure, with its subtask, after which another arm acts.
+The last of the eight values is 1 where the demonstration has no such step; the action of its
+nearest step is repeated there, as in LeRobot's `action_is_pad`. A chunk ends with its episode and,
+in a whole procedure, with its subtask, after which another arm acts.
 
-Frames may be few, actions are those of every control step. A dataset that was rendered with
-`--frame-stride` holds no others than its frames': the rest is read from its demonstrations, which
-are known by their hash.
+Frames may be sparse, but actions are those of every control step. A dataset rendered with
+`--frame-stride` holds only its frames' actions. The rest is read from its demonstrations, which
+are identified by their hash.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from surgicai_vision.dataset.subset import DatasetSubset
 from surgicai_vision.demos.store import demos_digest, list_demos, read_demo
 
 BESIDE = "demos"
-"""Where the demonstrations of a dataset lie, beside it, in a sweep."""
+"""Folder next to a sweep's dataset that holds its demonstrations."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Timeline:
 
     Attributes:
         action: (M, 7) float32.
-        first: (M,) first step of each step's run: of its demonstration and its subtask.
-        last: (M,) last step of it.
+        first: (M,) first step of each step's run (one subtask of one demonstration).
+        last: (M,) last step of that run.
         step: (L,) the step of each frame of the dataset as it was rendered.
     """
 
@@ -49,15 +49,15 @@ class Timeline:
 
 
 def timeline_of(dataset: Dataset, demos: Path | None = None) -> Timeline:
-    """Return the timeline of a dataset, of all it was selected from.
+    """Return the timeline of a dataset, or of the whole dataset that it was selected from.
 
     Args:
         dataset: any dataset.
         demos: the folder of its demonstrations, for one that was rendered with fewer frames; by
-            default the one beside it, of a sweep.
+            default the folder next to it, as in a sweep.
 
     Raises:
-        InputError: frames were left out, and the demonstrations are not there or other ones.
+        InputError: frames were left out, and the demonstrations are missing or different ones.
     """
     root = _root(dataset)
     if root.fps == names.FPS:
@@ -100,9 +100,9 @@ def with_chunks(dataset: Dataset, timeline: Timeline, offsets: Sequence[int]) ->
     """Return a dataset with the column `names.ACTION_CHUNK`, (N, T, 8) float32.
 
     Args:
-        dataset: any frames of the dataset that `timeline` is of.
-        timeline: of `timeline_of`.
-        offsets: (T,) which actions a chunk holds, in control steps from the present one.
+        dataset: any frames of the dataset that `timeline` belongs to.
+        timeline: from `timeline_of`.
+        offsets: (T,) offsets of a chunk's actions, in control steps from the present one.
     """
     present = timeline.step[_rows(dataset)]
     wanted = present[:, None] + np.asarray(offsets, np.int64)
@@ -118,14 +118,14 @@ def with_chunks(dataset: Dataset, timeline: Timeline, offsets: Sequence[int]) ->
 
 
 def _root(dataset: Dataset) -> Dataset:
-    """Return what a dataset was selected from, itself where it is whole."""
+    """Return the dataset that a subset was selected from, or a whole dataset itself."""
     while isinstance(dataset, DatasetSubset):
         dataset = dataset.whole
     return dataset
 
 
 def _rows(dataset: Dataset) -> NDArray[np.int64]:
-    """Return where a dataset's frames are in its root, (N,)."""
+    """Return the rows of a dataset's frames in its root, (N,)."""
     rows = np.arange(dataset.length)
     while isinstance(dataset, DatasetSubset):
         rows = dataset.rows[rows]
@@ -150,13 +150,13 @@ def _runs(
 
 
 def earlier_rows(dataset: Dataset, moments: int) -> NDArray[np.int64]:
-    """Return which frames a policy with a history sees at each frame, (N, moments) int64.
+    """Return the rows of the frames that a policy with a history sees, (N, moments) int64.
 
-    The present frame is the last; at the start of a run the first stands for what came before.
+    The present frame is the last; at the start of a run the first frame is repeated.
 
     Args:
         dataset: its frames are evenly spaced within a run.
-        moments: observations that the policy sees.
+        moments: number of observations that the policy sees.
     """
     index = np.asarray(dataset.episode_index)
     times = np.rint(np.asarray(dataset.columns()["timestamp"], np.float64) * names.FPS)

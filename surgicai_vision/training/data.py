@@ -22,11 +22,11 @@ Columns = Mapping[str, NDArray[np.generic]]
 
 
 def column(dataset: Dataset, key: str) -> NDArray[np.generic]:
-    """Return a column that is trained on: a recorded one, or one that is computed of them.
+    """Return a training column: a recorded one, or one computed from them.
 
     Raises:
         UnknownName: the dataset has no such column.
-        InputError: a column that this dataset's frames do not allow to compute.
+        InputError: the column cannot be computed from this dataset's frames.
     """
     columns = dataset.columns()
     if key in COMPUTED:
@@ -43,7 +43,7 @@ def _clock(columns: Columns, episode_index: NDArray[np.int64]) -> NDArray[np.flo
 COMPUTED: Mapping[str, Callable[[Columns, NDArray[np.int64]], NDArray[np.generic]]] = (
     MappingProxyType({names.CLOCK: _clock, names.STAGE: stages})
 )
-"""Column that no dataset holds → (its columns, (N,) episode of every frame) → (N, n) values."""
+"""Computed column → function (columns, (N,) episode of every frame) → (N, n) values."""
 
 
 def split(
@@ -56,10 +56,10 @@ def split(
 
     Args:
         episode_index: (N,) episode of every frame.
-        recipe: its `split` ("episode" or "transition") and `validation` (share held out) count.
-        seed: of the draw.
+        recipe: its `split` ("episode" or "transition") and `validation` (share held out) are used.
+        seed: seed of the random draw.
         demonstration_index: (N,) demonstration of every frame, where several episodes show one;
-            each episode is one by default.
+            by default each episode is its own demonstration.
 
     Returns:
         Training rows, validation rows (both sorted int64), and the episodes held out (whole ones
@@ -81,14 +81,14 @@ def split(
 def _first_variants(
     episode_index: NDArray[np.int64], demonstration_index: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return of every frame the row of the same one in its demonstration's first variant, (N,)."""
+    """Return the row of every frame's counterpart in its demonstration's first variant, (N,)."""
     position = np.arange(len(episode_index)) - np.searchsorted(episode_index, episode_index)
     first: NDArray[np.int64] = np.searchsorted(demonstration_index, demonstration_index) + position
     return first
 
 
 def cuts(count: int, size: int) -> list[int]:
-    """Return where the batches of `count` rows begin; a last batch of one joins the one before."""
+    """Return the batches' first rows for `count` rows; a single last row joins the batch before."""
     starts = list(range(0, count, size))
     return starts[:-1] if len(starts) > 1 and count - starts[-1] == 1 else starts
 
@@ -98,7 +98,7 @@ def over_places(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Give all places of a feature map their channel's statistics.
 
-    A place that hardly changes is not amplified so.
+    This keeps a place that hardly changes from being amplified.
 
     Args:
         mean: (inputs,) means of the inputs, the views' rows first.

@@ -1,15 +1,15 @@
-"""The folder of a training: what was asked for in it, and the state that it goes on from.
+"""The folder of a training: its request, and the state from which it resumes.
 
     if done := begin(out, request):    # refuses another training's folder
         return done
     …
-    write_state(out, state)            # every so often; a kill costs what came since
-    state = read_state(out)            # None where there is no whole one
+    write_state(out, state)            # periodically; a kill loses only what came since
+    state = read_state(out)            # None if there is no complete one
     …
     remove_state(out)                  # the checkpoint is written
 
-A state is plain data and tensors; it is read as such and runs no code. Its file begins with the
-sha256 of what follows: one that was damaged, or that something else wrote, is no whole state.
+A state is plain data and tensors; reading it runs no code. Its file begins with the sha256 of what
+follows, so a file that is damaged or was written by something else is not a complete state.
 """
 
 import hashlib
@@ -35,14 +35,14 @@ DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def begin(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
-    """Make a training's folder, or take one of the same request; return what is finished there.
+    """Make a training's folder, or reuse one of the same request; return a finished checkpoint.
 
     Args:
         out: the checkpoint folder.
         request: everything that decides the result, as plain data.
 
     Returns:
-        The checkpoint of a finished training; None where there is something to train.
+        The checkpoint of a finished training; None if there is something left to train.
 
     Raises:
         OutputExists: `out` holds something else.
@@ -62,7 +62,7 @@ def begin(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
 
 
 def write_state(out: Path, state: Mapping[str, Any]) -> None:
-    """Write what a training goes on from, whole."""
+    """Write the state from which a training resumes, atomically."""
     content = io.BytesIO()
     torch.save(dict(state), content)
     written = content.getvalue()
@@ -70,7 +70,7 @@ def write_state(out: Path, state: Mapping[str, Any]) -> None:
 
 
 def read_state(out: Path) -> dict[str, Any] | None:
-    """Return what a training goes on from, on the CPU; None where there is no whole state."""
+    """Return the state from which a training resumes, on the CPU; None if none is complete."""
     try:
         content = (out / STATE).read_bytes()
     except OSError:

@@ -3,8 +3,8 @@
     push_policy(Path("outputs/train/…"), "somebody/suturing-grasp-bc")
     pull_policy("somebody/suturing-grasp-bc", Path("outputs/train/pulled"))
 
-What is shared is the checkpoint as it lies in its folder, so its own hashes tell whether it was
-changed on the way. `PyTorchModelHubMixin` would write a second format, without them.
+The checkpoint is shared as it is in its folder, so its own hashes show whether it was changed on
+the way. `PyTorchModelHubMixin` would write a second format, without hashes.
 """
 
 import io
@@ -33,7 +33,7 @@ LICENCE = "mit"
 
 @dataclass(frozen=True)
 class Successes:
-    """Counted successes of a policy on held-out starts.
+    """Measured successes of a policy on held-out starts.
 
     Attributes:
         count: successful episodes.
@@ -65,7 +65,7 @@ def model_card(
         checkpoint: the policy.
         repo: "user/name".
         licence: the Hub's short name of a licence.
-        successes: what an evaluation of this policy counted, where there is one.
+        successes: successes in an evaluation of this policy, if there is one.
     """
     from huggingface_hub import EvalResult, ModelCardData
 
@@ -123,7 +123,7 @@ surgicai-vision evaluate policy
 
 
 def _facts(checkpoint: Checkpoint) -> dict[str, str]:
-    """Return what the card tells of a policy, name by name."""
+    """Return the facts about a policy for its card, by name."""
     encoder = checkpoint.encoder
     held_out = len(checkpoint.validation_episodes)
     facts = {
@@ -170,15 +170,15 @@ def push_policy(
 
     Args:
         folder: the checkpoint folder.
-        repo: "user/name"; made when it does not exist.
+        repo: "user/name"; created if it does not exist.
         private: make it private.
         licence: the Hub's short name of a licence.
-        successes: what an evaluation of this policy counted, where there is one.
+        successes: successes in an evaluation of this policy, if there is one.
         api: the Hub's client; made here by default.
 
     Raises:
-        InputError: a bad name, or a policy that is fed another one's progress.
-        BadFile: no whole checkpoint.
+        InputError: a bad name, or a policy that is fed another policy's progress.
+        BadFile: not a complete checkpoint.
         SurgicaiError: offline, or the Hub refuses.
     """
     checkpoint = read_checkpoint(folder)
@@ -208,14 +208,14 @@ def pull_policy(
 
     Args:
         repo: "user/name".
-        out: folder to make.
+        out: folder to create.
         revision: branch, tag or commit; None takes the main branch.
         api: the Hub's client; made here by default.
 
     Raises:
         InputError: a bad name.
-        OutputExists: `out` holds something.
-        BadFile: what came is no whole policy, or was changed.
+        OutputExists: `out` is not empty.
+        BadFile: the download is not a complete policy, or was changed.
         SurgicaiError: offline, or the Hub refuses.
     """
     check_output(out)

@@ -34,11 +34,11 @@ from surgicai_vision.training.progress_input import copy_progress_policy
 from surgicai_vision.training.request import TrainingRequest
 from surgicai_vision.training.stage_errors import stage_errors
 
-STATE_EVERY = 5  # epochs between training states: a broken-off training loses at most these
+STATE_EVERY = 5  # epochs between training states: an interrupted training loses at most these
 STATISTICS_ROWS = 1024  # rows summed at a time
-WARM = 3  # updates made before the first that is timed
+WARM = 3  # warm-up updates before the first timed one
 TIMED = 20
-SMALLEST_STD = 1e-6  # an input that varies less is constant, and only its mean is removed
+SMALLEST_STD = 1e-6  # an input that varies less counts as constant: only its mean is removed
 
 Log = Callable[[int, dict[str, float]], None]
 """Called with (epoch, losses by name)."""
@@ -115,7 +115,7 @@ class Training:
         return self._write(out, self._conclude())
 
     def time_epoch(self, clock: Callable[[], float]) -> float:
-        """Return about how long an epoch takes [s], by `TIMED` updates and a validation."""
+        """Return an estimate of an epoch's duration [s], from `TIMED` updates and a validation."""
         batches = self._batches()
         self.policy.train()
         for rows in batches[:WARM]:
@@ -153,7 +153,7 @@ class Training:
         return torch.cat([self.policy(observed).cpu() for observed in normalised])
 
     def _optimiser(self) -> tuple[torch.optim.Optimizer, LRScheduler | None]:
-        """Return the recipe's optimiser and its schedule, or None where the learning rate stays."""
+        """Return the recipe's optimiser and its schedule (None for a constant learning rate)."""
         recipe = self.request.recipe
         kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
         optimiser = kind(
@@ -169,9 +169,9 @@ class Training:
     def _observed(self, rows: NDArray[np.int64]) -> torch.Tensor:
         """Return the raw inputs of some frames, (n, inputs) float32.
 
-        The views' features stand before the vector.
+        The views' features come before the vector.
         """
-        # Each view is copied once to where it stands: the maps of a batch are tens of megabytes.
+        # Each view is copied only once, into place: the maps of a batch are tens of megabytes.
         observed = torch.empty(len(rows), self.policy.inputs.dim)
         at = 0
         for entry in self.request.features:
@@ -183,7 +183,7 @@ class Training:
         return observed
 
     def _inputs(self, rows: NDArray[np.int64]) -> torch.Tensor:
-        """Return the raw inputs of some frames with what came before them, on the device.
+        """Return the raw inputs of some frames with their history, on the device.
 
         Returns:
             (n, inputs) float32, or (n, history, inputs) for a policy with a history.
@@ -226,7 +226,7 @@ class Training:
     def _batches(self) -> list[NDArray[np.int64]]:
         """Return the training rows of one epoch in a new order, batch by batch.
 
-        A last batch of one joins the one before.
+        A last batch of one row joins the one before.
         """
         order = self.order.permutation(self.rows)
         return np.split(order, cuts(len(order), self.request.recipe.batch_size)[1:])
@@ -259,11 +259,11 @@ class Training:
         return loss.item()
 
     def _averaged(self) -> AbstractContextManager[None]:
-        """Let the policy have the weights that are kept, for a while."""
+        """Give the policy the weights to be kept, within a `with` block."""
         return self.average.applied(self.policy) if self.average else nullcontext()
 
     def _augmented(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return normalised inputs as the recipe's augmentation leaves them.
+        """Return normalised inputs after the recipe's augmentation.
 
         Args:
             observed: (B, inputs.dim), or (B, history, inputs.dim).
@@ -282,7 +282,7 @@ class Training:
 
     @torch.no_grad()
     def _validate(self) -> float:
-        """Return the mean loss over the frames held out; a policy that samples draws the same."""
+        """Return the mean loss over the frames held out; a sampling policy repeats its draws."""
         self.policy.eval()
         total = 0.0
         with self._averaged(), torch.random.fork_rng(devices=cuda_devices(self.device)):
@@ -310,7 +310,7 @@ class Training:
         write_state(out, state)
 
     def _resume(self, out: Path) -> None:
-        """Go on from a training state, if there is a whole one."""
+        """Resume from a training state, if there is a complete one."""
         state = read_state(out)
         if state is None:
             return
@@ -326,7 +326,7 @@ class Training:
             self.average.restore(**state["average"])
 
     def _write(self, folder: Path, errors: StageErrors | None = None) -> Checkpoint:
-        """Write the policy as it stands."""
+        """Write the policy in its present state."""
         request = self.request
         dataset = request.dataset
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""Policies by name (other distributions add theirs), their recipes, a checkpoint's policy.
+"""Policies by name (other distributions can add theirs), their recipes, and loading checkpoints.
 
 * `load_recipe(policy, recipe, changes) -> recipe object`: the frozen settings of a policy from
   configs/recipes, with changes.
-* `load_policy(folder) -> policy` from a checkpoint folder; `policy.checkpoint` says all about it.
+* `load_policy(folder) -> policy` from a checkpoint folder; `policy.checkpoint` describes it.
 * `load_encoder_of(checkpoint, …)`: the encoder a policy was trained on, verified.
 """
 
@@ -37,7 +37,7 @@ _is_policy = instance_of("policies.base:Policy")
 
 
 def _fault(part: object) -> str:
-    """Return what is wrong with what is offered as a policy, "" if nothing."""
+    """Return what is wrong with an object offered as a policy, "" if nothing."""
     if fault := _is_plugin(part):
         return fault
     plugin = cast("Plugin", part)
@@ -68,9 +68,9 @@ POLICIES: Final = Registry["Plugin"](
 )
 """Policy name → its `policies.base.Plugin`."""
 ROWS: Final = 2
-"""Observations of which a policy of another distribution is asked for actions when it is made."""
+"""Observations on which a policy from another distribution is tested when it is built."""
 UNCHANGED: Final[Mapping[str, JSON]] = MappingProxyType({})
-"""No change: a recipe as it stands, a policy that acts by its own."""
+"""No changes: a recipe as it is, or a policy that acts by its own."""
 
 
 def register_policy(name: str, plugin: "Plugin", distribution: str = "") -> None:
@@ -78,7 +78,7 @@ def register_policy(name: str, plugin: "Plugin", distribution: str = "") -> None
 
     Raises:
         NameCollision: the name is taken.
-        InputError: this is no plug-in of a policy.
+        InputError: this is not a policy plug-in.
     """
     POLICIES.register(name, plugin, distribution)
 
@@ -91,7 +91,8 @@ def policy_names() -> tuple[str, ...]:
 def policy_plugin(name: str) -> "Plugin":
     """Import the policy plug-in of `name`; `UnknownName` lists what exists.
 
-    What another distribution's makes is looked at: it is a `Policy` and gives an action's values.
+    What a plug-in from another distribution builds is checked: it must be a `Policy` that returns
+    actions.
     """
     plugin = POLICIES.load(name)
     if POLICIES.is_ours(name):
@@ -102,10 +103,10 @@ def policy_plugin(name: str) -> "Plugin":
 def _made(
     name: str, plugin: "Plugin", recipe: "Recipe", visual: tuple[tuple[int, ...], ...]
 ) -> "Policy":
-    """Make a policy of another distribution.
+    """Build a policy from another distribution.
 
     Raises:
-        InputError: its code fails, or what it makes is no policy of actions.
+        InputError: its code fails, or the result is not a policy that returns actions.
     """
     with POLICIES.calling(name):
         policy = plugin.make(recipe, visual)
@@ -125,7 +126,7 @@ def _made(
 
 
 def _answer_shape(policy: "Policy") -> tuple[int, ...]:
-    """Return the shape of a policy's answers to `ROWS` observations; nothing is drawn or kept."""
+    """Return the shape of a policy's answers to `ROWS` observations, without side effects."""
     import torch  # the policy has imported it
 
     was_training = policy.training
@@ -141,7 +142,7 @@ def recipe_names() -> tuple[str, ...]:
 
 
 def default_recipe(policy: str) -> str:
-    """Return the recipe of a policy that is given without one: its own, else the paper's."""
+    """Return the default recipe of a policy: the one with its name, else the paper's."""
     return policy if policy in recipe_names() else "paper"
 
 
@@ -158,7 +159,7 @@ def load_recipe(
     Raises:
         UnknownName: a policy, recipe or key that does not exist.
         BadFile: a recipe file that cannot be read.
-        InputError: a value that is not allowed, or an entry of what is no table.
+        InputError: a value that is not allowed, or an entry of a key that is not a table.
     """
     plugin = policy_plugin(policy)
     path = Path(recipe)
@@ -166,13 +167,13 @@ def load_recipe(
         check_name("recipe", str(recipe), recipe_names())
         path = (configs_folder() / "recipes") / f"{recipe}.yaml"
     values: Mapping[str, object] = read_yaml(path, may_be_empty=True)
-    if "epochs" in changes:  # whoever says the epochs wants them, and no budget
+    if "epochs" in changes:  # an explicit number of epochs overrides the budget
         values = {key: value for key, value in values.items() if key != BUDGET}
     return from_mapping(plugin.recipe, _changed(values, changes), f"recipe {recipe}")
 
 
 def _changed(values: Mapping[str, object], changes: Mapping[str, JSON]) -> dict[str, object]:
-    """Return a recipe's values with changes, of whole keys and of single entries of a table."""
+    """Return a recipe's values with changes to whole keys and to single entries of a table."""
     changed = dict(values)
     for key, value in changes.items():
         table, dot, entry = key.partition(".")
@@ -187,7 +188,7 @@ def _changed(values: Mapping[str, object], changes: Mapping[str, JSON]) -> dict[
 
 
 def recipe_of(run: RunConfig) -> "Recipe":
-    """Return the recipe of a run with its changes: the one place where they meet.
+    """Return the recipe of a run with its changes; the only place that combines them.
 
     Raises:
         UnknownName: a policy, recipe or key that does not exist.
@@ -198,7 +199,7 @@ def recipe_of(run: RunConfig) -> "Recipe":
 
 
 def check_progress_from(recipe: "Recipe", progress_from: Path | None) -> None:
-    """Refuse a recipe that is fed progress without a policy that says it, and the reverse."""
+    """Refuse a recipe that feeds progress without a policy that predicts it, and vice versa."""
     if recipe.progress_input and progress_from is None:
         raise InputError(
             "The recipe feeds progress; give the policy that says it (--progress-from DIR)."
@@ -218,10 +219,10 @@ def load_policy(folder: Path | str, changes: Mapping[str, JSON] = UNCHANGED) -> 
         changes: as in `restore`.
 
     Returns:
-        The policy; `policy.checkpoint` says everything about it.
+        The policy; `policy.checkpoint` describes it.
 
     Raises:
-        BadFile: a folder that is no whole checkpoint, or one that was changed.
+        BadFile: a folder that is not a complete checkpoint, or one that was changed.
         InputError: a released policy that does not exist, or one of another scene.
     """
     return restore(read_checkpoint(released.resolve(folder)), changes)
@@ -231,12 +232,12 @@ def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> 
     """Build the trained policy of a checkpoint; see `load_policy`.
 
     Args:
-        checkpoint: whose policy.
-        changes: settings of its recipe by which it acts in the place of its own, of `ACTED_BY`; for
-            policies that plan chunks.
+        checkpoint: the checkpoint to restore.
+        changes: recipe settings from `ACTED_BY` that replace its own when it acts; for policies
+            that plan chunks.
 
     Raises:
-        UnknownName: a setting that decides what is learned, or none.
+        UnknownName: a setting that affects what is learned, or does not exist.
         InputError: a value that is not allowed, or a policy that plans no chunks.
     """
     plugin = policy_plugin(checkpoint.policy)
@@ -264,7 +265,7 @@ def load_encoder_of(checkpoint: Checkpoint, weights: WeightsSource = ANYWHERE) -
     """Load the encoder a policy was trained on, verified; None for a policy without images.
 
     Raises:
-        InputError: this is not the encoder it was trained on; else as `load_encoder`.
+        InputError: this is not the encoder it was trained on; otherwise as `load_encoder`.
     """
     record = checkpoint.encoder
     encoder = load_encoder(record.name, record.pool, weights) if record else None

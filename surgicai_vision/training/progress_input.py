@@ -1,14 +1,14 @@
-"""Progress as an input: what a high-level policy says of the progress, fed to a low-level one.
+"""Progress as an input: a high-level policy's predicted progress, fed to a low-level policy.
 
-A recipe with `progress_input` feeds, in the place of the clock, how far the subtask is as another
-policy says it (`policies.hlp` with `progress`). In training that is its prediction on the dataset's
-frames and not the label, so that the input errs as it will when the policy acts; when it acts, it
-is the prediction from the same images. The checkpoint has the other policy's in its folder
-`progress`, and its hash in its card.
+A recipe with `progress_input` feeds the progress of the subtask, as predicted by another policy
+(`policies.hlp` with `progress`), instead of the clock. In training this is the prediction on the
+dataset's frames, not the label, so that the input has the same errors as when the policy acts. When
+it acts, it is the prediction from the same images. The checkpoint contains that of the other policy
+in its folder `progress`, and the hash in its card.
 
 Interface:
 
-* `check_progress_policy(checkpoint, dataset)`: refuse what says no progress of this dataset's task.
+* `check_progress_policy(checkpoint, dataset)`: refuse one without progress of this dataset's task.
 * `with_progress(dataset, policy, features) -> Dataset`: the dataset with the column
   `names.PROGRESS`.
 * `copy_progress_policy(checkpoint, folder)`, `progress_policy_folder(checkpoint)`.
@@ -32,18 +32,18 @@ if TYPE_CHECKING:
     from policies.base import Policy
 
 FOLDER = "progress"
-"""Folder of the progress policy in the checkpoint of the policy that is fed by it."""
+"""Folder of the progress policy in the checkpoint of the policy that uses it."""
 ROWS = 1024
-"""Frames that are asked about at a time."""
+"""Frames predicted at a time."""
 PROGRESS_AT = len(names.SUBTASKS)
-"""Place of the progress in a high-level policy's answer, after the logits."""
+"""Index of the progress in a high-level policy's answer, after the logits."""
 
 
 def check_progress_policy(checkpoint: Checkpoint, dataset: Dataset) -> None:
-    """Refuse a policy that says no progress in this dataset's task.
+    """Refuse a policy that does not predict progress in this dataset's task.
 
     Raises:
-        InputError: it says none, or of another task, or it sees images of another size.
+        InputError: it predicts none, or that of another task, or it sees images of another size.
     """
     folder = checkpoint.folder
     if not checkpoint.recipe.get("progress"):
@@ -70,8 +70,8 @@ def with_progress(
 
     Args:
         dataset: any dataset.
-        policy: says the progress; one that `check_progress_policy` lets pass.
-        features: of the dataset's frames as the policy sees them, one entry a view.
+        policy: predicts the progress; one that `check_progress_policy` accepts.
+        features: of the dataset's frames as the policy sees them, one entry per view.
     """
     arms = np.asarray(dataset.columns()[names.BOTH_ARMS], np.float32)
     progress = []
@@ -89,17 +89,17 @@ def with_progress(
 
 
 def copy_progress_policy(checkpoint: Checkpoint, folder: Path) -> None:
-    """Copy a progress policy into the checkpoint folder of the policy that is fed by it."""
+    """Copy a progress policy into the checkpoint folder of the policy that uses it."""
     (folder / FOLDER).mkdir(parents=True, exist_ok=True)
     for name in (WEIGHTS, CARD):
         shutil.copyfile(checkpoint.folder / name, folder / FOLDER / name)
 
 
 def progress_policy_folder(checkpoint: Checkpoint) -> Path | None:
-    """Return the folder of the policy whose progress a policy is fed; None where it is fed none.
+    """Return the folder of the progress policy that a policy uses; None if it uses none.
 
     Raises:
-        BadFile: it is not there, or it is another one.
+        BadFile: it is missing, or it is another policy.
     """
     if not checkpoint.progress_sha256:
         return None

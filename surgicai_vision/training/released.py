@@ -1,22 +1,22 @@
-"""Released policies: trained ones that come with the product, under the names `released:NAME`.
+"""Released policies: trained policies shipped with the product as `released:NAME`.
 
 Interface:
 
-* `resolve(given) -> Path`: the path a verb's policy stands for; `released:grasp` becomes the folder
-  of a checkpoint or the YAML file of a hierarchical policy, verified, and anything else itself.
+* `resolve(given) -> Path`: the path of a policy given to a command. `released:grasp` becomes the
+  verified folder of a checkpoint or YAML file of a hierarchical policy; a path stays as it is.
 * `released_names()`, `read_card(name)`, `mismatch(card)`: what `surgicai-vision policies` lists.
-* `write_released(card, contents)`: what `surgicai-vision release` does last.
+* `write_released(card, contents)`: the last step of `surgicai-vision release`.
 
-Layout of `released_folder()`, a folder a policy:
+Layout of `released_folder()`, one folder per policy:
 
     grasp/card.json            what it is, where it came from and what it solves; written last
-    grasp/checkpoint.json      a checkpoint as `train` leaves it
+    grasp/checkpoint.json      a checkpoint as `train` writes it
     grasp/policy.safetensors
     suture/card.json
     suture/hierarchical.yaml   a hierarchical policy, whose parts are `released:` policies
 
-A policy belongs to the scene it was trained in: where the present scene has another hash, it is
-refused in one line that says how to build it anew. Whoever distributes other policies points
+A policy belongs to the scene it was trained in: if the present scene has another hash, it is
+refused in one line that says how to rebuild it. To distribute other policies, point
 `$SURGICAI_VISION_RELEASED` to a folder of the same layout.
 """
 
@@ -33,7 +33,7 @@ from surgicai_vision.training.run_config import RunConfig, Starts
 
 PREFIX = "released:"
 VARIABLE = "SURGICAI_VISION_RELEASED"
-"""Environment variable with a folder of released policies, in place of the package's."""
+"""Environment variable with a folder of released policies to use instead of the package's."""
 CARD = "card.json"
 PROCEDURE = "hierarchical.yaml"
 FORMAT = 1
@@ -51,13 +51,13 @@ class ReleaseCard:
         licence: its licence.
         encoder: the frozen encoder it needs, with the source and the licence of its weights, in
             words; empty without images.
-        files: name of each file beside the card → its sha256.
+        files: name of each file next to the card → its sha256.
         parts: name of each released policy that this one consists of → sha256 of its weights.
-        command: what built it.
+        command: the command that built it.
         code_version: version of this package.
-        successes: successful episodes; None for a policy that is judged as part of another.
-        starts: the held-out starts they were counted on.
-        solved: the first few of them that it solved; a test solves them again.
+        successes: successful episodes; None for a policy evaluated only as part of another.
+        starts: the held-out starts they were measured on.
+        solved: the first few starts that it solved; a test solves them again.
         format: version of this layout.
     """
 
@@ -83,7 +83,7 @@ class ReleaseCard:
 
     @property
     def counted(self) -> str:
-        """Return "97/100 (starts 900000–900099)", or "–" for a part that is judged in a whole."""
+        """Return "97/100 (starts 900000–900099)", or "–" for a part evaluated in a whole."""
         if self.successes is None or self.starts is None:
             return "–"
         seeds = self.starts.seeds
@@ -107,15 +107,15 @@ def is_released(given: str | Path) -> bool:
 
 
 def resolve(given: str | Path) -> Path:
-    """Return the path that a policy stands for; a released one is verified.
+    """Return the path of a policy; a released one is verified.
 
     Args:
         given: "released:NAME", or the path of a checkpoint or of a hierarchical policy.
 
     Raises:
-        UnknownName: no such policy is released; names the nearest.
-        InputError: nothing is released, or the policy is of another scene.
-        BadFile: its files or its parts are not those its card was written for.
+        UnknownName: no such policy is released; the message gives the nearest name.
+        InputError: nothing is released, or the policy belongs to another scene.
+        BadFile: its files or its parts do not match its card.
     """
     if not is_released(given):
         return Path(given)
@@ -176,8 +176,8 @@ def read_card(name: str) -> ReleaseCard:
 
 
 def mismatch(card: ReleaseCard) -> str:
-    """Return why the policy does not belong to the present scene, "" where it does."""
-    from surgicai_vision.scene import build_scene  # not above: `--help` reads this module
+    """Return why the policy does not belong to the present scene, "" if it does."""
+    from surgicai_vision.scene import build_scene  # not at the top: `--help` imports this module
 
     present = build_scene(card.env.scene).hash
     if present == card.scene_hash:
@@ -186,7 +186,7 @@ def mismatch(card: ReleaseCard) -> str:
 
 
 def write_released(card: ReleaseCard, contents: Mapping[str, bytes]) -> Path:
-    """Put a policy into `released_folder()`; an earlier one of its name is replaced.
+    """Put a policy into `released_folder()`, replacing an earlier one of the same name.
 
     Args:
         card: its card; `files` is filled in.

@@ -1,6 +1,6 @@
-"""What is asked of a training: its data, its policy, its recipe.
+"""The request of a training: its data, its policy, its recipe.
 
-`check_request` refuses what cannot be trained; `request_table` is what a folder is marked with
+`check_request` refuses what cannot be trained; `request_table` is the data that marks a folder
 (`training.folder`).
 """
 
@@ -38,7 +38,7 @@ class TrainingRequest:
 
     @property
     def trained_run(self) -> RunConfig:
-        """The run with what is known of it once its features and its dataset are."""
+        """The run, completed with what its features and its dataset determine."""
         first = self.features[0].manifest if self.features else None
         return replace(
             self.run,
@@ -54,21 +54,21 @@ class TrainingRequest:
 
     @functools.cached_property
     def columns(self) -> Mapping[str, NDArray[np.generic]]:
-        """What it is fed beside features (else the state), and what it learns, by their names."""
+        """The columns fed alongside features (else the state) and the one learned, by name."""
         with torch.random.fork_rng(devices=[]):
             vector = self.untrained().inputs.vector
         keys = (*(vector or (names.STATE,)), self.policy.target)
         return {key: column(self.dataset, key) for key in keys}
 
     def untrained(self) -> Policy:
-        """Return the policy as it is before training.
+        """Return the untrained policy.
 
         Raises:
-            InputError: the recipe's network is one that this machine has no room for.
+            InputError: the recipe's network is too large for this machine.
         """
         try:
             return self.policy.make(self.recipe, tuple(entry.shape for entry in self.features))
-        except (RuntimeError, MemoryError) as error:  # torch has no error of its own for that
+        except (RuntimeError, MemoryError) as error:  # torch has no specific error for this
             raise InputError(
                 f"Policy '{self.policy.name}' cannot be built by its recipe "
                 f"({first_line(error)}); choose smaller layers."
@@ -109,7 +109,7 @@ def request_table(request: TrainingRequest, start: Policy | None) -> dict[str, J
 
     Args:
         request: what is trained.
-        start: the trained policy that it starts from.
+        start: the trained policy to start from.
     """
     first = request.features[0].manifest if request.features else None
     weights = () if start is None else start.state_dict().values()

@@ -1,7 +1,7 @@
-"""A run: one policy from its demonstrations to its counted successes, as data.
+"""A run: one policy from its demonstrations to its measured successes, as data.
 
-A `RunConfig` is stored whole wherever results of the run are: in its checkpoint, its evaluation,
-the record of its failure and a sweep's folders. Names are printed from it and never parsed.
+A `RunConfig` is stored in full wherever results of the run are: in its checkpoint, its evaluation,
+the record of its failure and a sweep's folders. Names are derived from it and never parsed.
 
 Light to import, for the command line.
 """
@@ -18,21 +18,21 @@ from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.core.variants import Variants
 
 OWN = "own"
-"""Stands for an encoder: a network of the policy's own, trained with it on the images."""
+"""Name used instead of an encoder's: the policy trains its own network on the images."""
 REFERENCES = ("expert", "random", "zero", "replay", "recover")
-"""Policies that are not trained: what the trained ones stand beside."""
+"""Policies that are not trained: references for the trained ones."""
 EXPERTS = ("expert", "recover")
-"""Those of them that read the simulator's state."""
+"""References that read the simulator's state."""
 LEROBOT_POLICIES = ("act", "diffusion")
-"""Policies that a grid trains by `lerobot-train`, for a number of updates."""
+"""Policies that a grid trains with `lerobot-train`, for a number of updates."""
 ACTORS = ("actor", "bcq")
-"""Policies that `rl.train` leaves: they are fed the state with the goal."""
+"""Policies that `rl.train` produces: they are fed the state with the goal."""
 TERMINATIONS = ("privileged", "learned")
 """How a subtask ends under a hierarchical policy."""
 BUDGET = "minutes"
-"""Setting of a recipe that bounds its training (`policies.chunks.ChunkRecipe`)."""
+"""Recipe setting that limits the training time (`policies.chunks.ChunkRecipe`)."""
 ACTED_BY = ("execute", "samples", "ensemble")
-"""Settings of such a recipe by which chunks are acted; what is learned does not depend on them."""
+"""Settings of such a recipe for executing chunks; they do not affect what is learned."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Starts:
 
     @property
     def bank(self) -> str:
-        """What they are to a policy (`bank_of`); across banks, what the least independent is."""
+        """Bank of these starts (`bank_of`); across banks, that of the least independent start."""
         return bank_of(self.first_seed)
 
 
@@ -73,45 +73,46 @@ class Shift:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that decides what a run is.
+    """Everything that defines a run.
 
     Attributes:
-        env: the task, its scene and what differs from episode to episode: those of the
-            demonstrations before an evaluation, those of the evaluation after it.
-        encoder: encoder's name; `OWN` for a policy with a network of its own on the images; None
-            for a policy without images.
+        env: the task, its scene and what varies between episodes: those of the demonstrations
+            before an evaluation, those of the evaluation after it.
+        encoder: encoder's name; `OWN` for a policy with its own network on the images; None for a
+            policy without images.
         views: its views, in the order of the features; empty without images.
-        policy: policy's name; one of `REFERENCES` for what is not trained.
-        pool: what is taken from the encoder.
-        privileged: see the state with the goal in place of all else, an upper bound; of a
-            hierarchical policy, whether a policy that acts in it sees it.
+        policy: policy's name; one of `REFERENCES` if it is not trained.
+        pool: which output of the encoder is used.
+        privileged: see only the state with the goal, an upper bound; for a hierarchical policy,
+            whether any policy within it sees that state.
         recipe: the policy's recipe: a name, or the path of a YAML file.
-        changes: what is changed in the recipe, "key=value" each.
-        demonstrations: demonstrations trained on, those of the validation split included; None
-            for all there are, where they are not counted yet.
-        demonstrator: who demonstrated; None where it is not known.
-        noise: how much what the demonstrator executed was disturbed.
-        post_success_steps: control steps that demonstrations go on after their success.
-        frame_stride: control steps from frame to frame of the dataset.
-        variants: the looks in which each demonstration was rendered, where a plan says so; None as
-            it was recorded, or where it is not known.
-        multiplied_from: how many demonstrations those trained on were re-posed from
-            (`demos.multiply`), where a plan says so; None where they were not.
-        dagger_rounds: rounds of DAgger that the demonstrations hold, where a plan says so.
-        recorded_in: the env of the demonstrations, where the evaluation's world is another or
-            shifted (`evaluated_in`); None where it is the same.
-        updates: updates of the weights and `batch_size`, for LeRobot's policies.
-        batch_size: frames of an update, for LeRobot's policies.
+        changes: changes to the recipe, "key=value" each.
+        demonstrations: number of demonstrations trained on, including the validation split; None
+            for all available, if they are not counted yet.
+        demonstrator: who demonstrated; None if unknown.
+        noise: strength of the disturbance of the demonstrator's executed actions.
+        post_success_steps: control steps that demonstrations continue after their success.
+        frame_stride: control steps between frames of the dataset.
+        variants: the looks in which each demonstration was rendered, if a plan sets them; None if
+            as recorded, or unknown.
+        multiplied_from: number of demonstrations from which those trained on were re-posed
+            (`demos.multiply`), if a plan sets it; None if they were not.
+        dagger_rounds: DAgger rounds included in the demonstrations, if a plan sets them.
+        recorded_in: the env of the demonstrations, if the evaluation's world differs or is shifted
+            (`evaluated_in`); None if it is the same.
+        updates: updates of the weights, for LeRobot's policies and offline learning; decisions, for
+            a high-level policy trained by PPO.
+        batch_size: frames per update, for LeRobot's policies.
         seed: training seed.
         algo: the algorithm of reinforcement or offline learning (`rl.algorithms`) that trained it,
             "residual-td3" for a correction; None for imitation from a dataset.
-        env_steps: control steps that it took in the env to learn; 0 offline.
-        termination: how subtasks end, where this is a hierarchical policy (`TERMINATIONS`).
-        parts: digest of the file that names the policies of a hierarchical policy; empty where
-            they are trained by this run.
-        expert_swap: the subtask of a hierarchical policy that the expert does.
-        acted_by: settings by which its chunks are acted in an evaluation, "key=value" each, in the
-            place of its recipe's (`ACTED_BY`).
+        env_steps: control steps taken in the env for learning; 0 offline.
+        termination: how subtasks end, if this is a hierarchical policy (`TERMINATIONS`).
+        parts: digest of the file that names the policies of a hierarchical policy; empty if this
+            run trains them.
+        expert_swap: the subtask of a hierarchical policy that the expert performs.
+        acted_by: settings for executing its chunks in an evaluation, "key=value" each, instead of
+            its recipe's (`ACTED_BY`).
         starts: start states of the evaluation; None before it.
         shift: what is shifted in an evaluation of robustness.
         upset: one thing goes wrong in every episode of the evaluation (`envs.upset`).
@@ -187,7 +188,7 @@ class RunConfig:
 
     @property
     def by_lerobot_train(self) -> bool:
-        """Whether a sweep trains it by `lerobot-train`, and not from cached features."""
+        """Whether a sweep trains it with `lerobot-train`, and not from cached features."""
         return self.policy in LEROBOT_POLICIES and self.updates is not None
 
     @property
@@ -197,7 +198,7 @@ class RunConfig:
 
     @property
     def sees_goal(self) -> bool:
-        """Whether the policy, or one that acts in it, sees the state with the goal.
+        """Whether the policy, or any policy within it, sees the state with the goal.
 
         No robot knows that state.
         """
@@ -206,7 +207,7 @@ class RunConfig:
 
     @property
     def inputs(self) -> str:
-        """What the policy is fed, in words."""
+        """The policy's inputs, in words."""
         if self.encoder:
             return f"{self.encoder}-{'+'.join(self.views)}"
         if self.privileged:
@@ -215,14 +216,14 @@ class RunConfig:
 
     @property
     def recipe_label(self) -> str:
-        """The recipe's name and what is changed in it."""
+        """The recipe's name and its changes."""
         return "+".join((Path(self.recipe).stem, *self.changes))
 
     @property
     def name(self) -> str:
-        """How tables and folders call the policy: its inputs and whatever is not as usual.
+        """The policy's name in tables and folders: its inputs and all that is not the default.
 
-        With `upset` it ends in "-upset", so that disturbed rows are never taken for others.
+        With `upset` it ends in "-upset", so that disturbed rows are never mistaken for others.
         """
         return f"{self._name}-upset" if self.upset else self._name
 
@@ -251,19 +252,19 @@ class RunConfig:
 
     @property
     def recipe_changes(self) -> dict[str, JSON]:
-        """Keys of the recipe that are replaced, with their values: the only way to change one."""
+        """Recipe keys that are replaced, with their values: the only way to change a recipe."""
         return read_changes(self.changes) | ({"privileged": True} if self.privileged else {})
 
 
 def with_epochs(changes: tuple[str, ...], epochs: int | None) -> tuple[str, ...]:
-    """Return the changes of a recipe with the number of epochs among them, where one is given."""
+    """Return a recipe's changes, including the number of epochs if one is given."""
     return changes if epochs is None else (*changes, f"epochs={epochs}")
 
 
 def with_budget(
     changes: tuple[str, ...], epochs: int | None, minutes: float | None
 ) -> tuple[str, ...]:
-    """Return the changes of a recipe with the length of the training among them.
+    """Return a recipe's changes, including the length of the training if one is given.
 
     Raises:
         InputError: epochs and minutes are both given.
@@ -275,11 +276,11 @@ def with_budget(
 
 
 def evaluated_in(run: RunConfig, env: TaskConfig, shift: Shift | None = None) -> RunConfig:
-    """Return a run in the env of an evaluation; it remembers the world that it learned in.
+    """Return a run with the env of an evaluation; it still records the world it learned in.
 
     Args:
         run: the run.
-        env: the evaluation's, as the shift leaves it.
+        env: the evaluation's env, with the shift applied.
         shift: what is shifted there, if anything.
     """
     learned = run.recorded_in or run.env
@@ -291,7 +292,7 @@ def evaluated_in(run: RunConfig, env: TaskConfig, shift: Shift | None = None) ->
 
 
 def of_training(run: RunConfig) -> RunConfig:
-    """Return a run without what belongs to one evaluation of it."""
+    """Return a run without the fields that belong to one evaluation of it."""
     return dataclasses.replace(
         run,
         env=run.recorded_in or run.env,

@@ -1,7 +1,7 @@
-"""How well a high-level policy says which subtask is due and how far the present one is.
+"""How well a high-level policy predicts the subtask that is due and the present one's progress.
 
-`stage_errors(answers, target) -> StageErrors`: counted over the frames held out of its training,
-and kept in its checkpoint; the report shows them.
+`stage_errors(answers, target) -> StageErrors`: measured on the frames held out of its training, and
+stored in its checkpoint; the report shows them.
 """
 
 import numpy as np

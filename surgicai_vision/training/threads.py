@@ -8,8 +8,8 @@ from contextlib import contextmanager
 def one_thread() -> Iterator[None]:
     """Let torch compute with one thread.
 
-    Sums keep their order whatever the machine, and processes share the cores. For a network as
-    small as ours threads cost more than they save, seventeen times more on busy cores.
+    Sums then keep their order on any machine, and processes share the cores. For networks as small
+    as ours, threads cost more than they save: seventeen times more on busy cores.
     """
     import torch  # not at the top: commands that only name a policy start without it
 

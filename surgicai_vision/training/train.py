@@ -3,23 +3,22 @@
 Interface:
 
 * `train(dataset, features, policy, recipe, seed=…, out=…, progress=…) -> Checkpoint`: train from
-  the feature cache. Running it again goes on where it was broken off, or returns what is done.
+  the feature cache. Running it again resumes an interrupted training, or returns a finished one.
 * `epochs_within(minutes, …)`: how many epochs fit into a budget.
-* What is asked of a training: `surgicai_vision.training.request`; its epochs: `loop`; what it reads
-  of a dataset, its split and its batches: `data`.
+* The request of a training is in `surgicai_vision.training.request`, its epochs are in `loop`, its
+  columns, split and batches in `data`.
 
-Layout of the folder while it trains; the first and the last two stay (see
+Layout of the folder during training; the first and the last two files stay (see
 `surgicai_vision.training.checkpoint`):
 
-    training.json          what was asked for; marks the folder as ours
+    training.json          the request; marks the folder as ours
     training_state.pt      weights, optimiser and random state every few epochs
-    epochs/epoch_0010/     a complete checkpoint every `save_every` epochs, when asked for
+    epochs/epoch_0010/     a complete checkpoint every `save_every` epochs, if requested
     policy.safetensors     weights and the statistics of the inputs
     checkpoint.json        everything about them, with their hash; written last
 
-The split is by episode unless the recipe says otherwise. The validation loss is reported and
-chooses nothing: the last epoch is the checkpoint. The same seed gives the same weights on one
-machine.
+The split is by episode unless the recipe says otherwise. The validation loss is only reported: the
+checkpoint is always that of the last epoch. The same seed gives the same weights on one machine.
 """
 
 import ctypes
@@ -42,7 +41,7 @@ from surgicai_vision.training.request import TrainingRequest, check_request, req
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
 
-TRIM_THRESHOLD = -1  # of malloc.h, as is the next
+TRIM_THRESHOLD = -1  # from malloc.h, like the next
 MMAP_THRESHOLD = -3
 
 
@@ -70,15 +69,15 @@ def train(
             proprioception alone.
         policy: a `policies.base.Plugin`.
         recipe: an instance of `policy.recipe`.
-        seed: of the initialisation, the split and the order of frames.
-        out: the checkpoint folder; new, or one of the same request, which is then continued.
-        progress: called with (epochs done, epochs in all).
-        run: what is trained, stored in the checkpoint with what this training knows better: its
-            task, inputs and number of demonstrations.
-        save_every: also keep a checkpoint every so many epochs; 0 keeps the last alone.
+        seed: seed of the initialisation, the split and the order of frames.
+        out: the checkpoint folder; new, or one of the same request, which is then resumed.
+        progress: called with (epochs done, epochs in total).
+        run: the run, stored in the checkpoint; this training fills in its task, inputs and number
+            of demonstrations.
+        save_every: also keep a checkpoint after every this many epochs; 0 keeps only the last.
         start: a trained policy with the same inputs to start from (fine-tuning).
-        progress_policy: checkpoint of the policy that said the dataset's progress
-            (`training.progress_input`), where the recipe feeds it; it is copied into `out`.
+        progress_policy: checkpoint of the policy that predicted the dataset's progress
+            (`training.progress_input`), if the recipe feeds it; it is copied into `out`.
         device: torch device to train on.
         log: called with (epoch, losses by name) after each epoch.
 
@@ -111,10 +110,10 @@ def epochs_within(
     seed: int = 0,
     device: str = "cpu",
 ) -> int:
-    """Return how many epochs fit into so many minutes of one core, at least 1.
+    """Return how many epochs fit into `minutes` of one core, at least 1.
 
-    A few updates are made and timed by the processor's clock, so that other processes do not count;
-    what they learn is thrown away. On a GPU it is the wall's clock.
+    A few updates are made and timed in CPU time, so that other processes do not count; their result
+    is discarded. On a GPU, wall-clock time is used.
     """
     request = TrainingRequest(
         dataset, tuple(features), policy, recipe, seed, RunConfig(recipe="custom")
@@ -133,9 +132,9 @@ def epochs_within(
 
 @contextmanager
 def _repeatable(device: torch.device) -> Iterator[None]:
-    """Let the same seed give the same weights, and the caller's random numbers be as they were.
+    """Make the same seed give the same weights, and leave the caller's random state unchanged.
 
-    On a GPU that takes kernels that sum in a fixed order.
+    On a GPU this requires kernels that sum in a fixed order.
     """
     fixed_order = torch.backends.cudnn.flags(enabled=True, deterministic=True)
     with torch.random.fork_rng(devices=cuda_devices(device)), one_thread(), fixed_order:
@@ -143,10 +142,10 @@ def _repeatable(device: torch.device) -> Iterator[None]:
 
 
 def _keep_memory() -> None:
-    """Let glibc keep what is freed.
+    """Make glibc keep freed memory.
 
-    A batch of feature maps is allocated anew each step, and handing its pages back and forth costs
-    1.5 times the arithmetic (221 against 84 ms of CPU a step of 256 maps of 48 × 28 × 28).
+    A batch of feature maps is allocated anew at each step, and returning its pages to the system
+    costs 1.5 times the arithmetic (221 against 84 ms of CPU per step of 256 maps of 48 × 28 × 28).
     """
     with suppress(OSError, AttributeError):  # another C library
         mallopt = ctypes.CDLL(None).mallopt

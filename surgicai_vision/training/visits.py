@@ -1,8 +1,8 @@
-"""Visits: from the recorded phases of an episode to what a high-level policy learns.
+"""Visits: from the recorded phases of an episode to the targets of a high-level policy.
 
-A visit is a run of frames of one phase in one episode. It is finished if a later phase follows, or
-nothing: episodes are recorded to their success. A visit that an earlier phase follows was broken
-off: something went wrong, and the demonstrator went back.
+A visit is a run of frames of one phase in one episode. It is finished if a later phase follows or
+the episode ends: episodes are recorded until their success. If an earlier phase follows, the visit
+was broken off: something went wrong, and the demonstrator went back.
 
 Interface:
 
@@ -24,15 +24,15 @@ from surgicai_vision.core.config import DWELL
 from surgicai_vision.core.errors import InputError
 
 AHEAD = 10
-"""Control steps by which the subtask that is due is ahead.
+"""Control steps by which the label of the subtask that is due is shifted ahead.
 
 In our recordings a subtask continues for `DWELL` steps after its success, while hardly anything
 moves. Without the shift its last frames and the first of the next subtask would look alike with
-different labels, and a policy would name the old subtask for ever; what is due there is the next
-one (docs/hierarchical.md has the measurement).
+different labels, and a policy would predict the old subtask forever. With it, the next subtask is
+due in those frames (docs/hierarchical.md has the measurement).
 """
 UNKNOWN = -1.0
-"""Progress of a frame whose visit was broken off: it has no end to count towards."""
+"""Progress of a frame whose visit was broken off: there is no end to measure it against."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Visits:
 
 
 def find_visits(phase: NDArray[np.int64], episode_index: NDArray[np.int64]) -> Visits:
-    """Return the visits of frames with these phases, (N,), and episodes, (N,) rising."""
+    """Return the visits of frames with these phases, (N,), and episodes, (N,) ascending."""
     begins = np.ones(len(phase), bool)
     begins[1:] = (np.diff(phase) != 0) | (np.diff(episode_index) != 0)
     first = np.flatnonzero(begins)
@@ -77,14 +77,14 @@ def subtasks_due(
     """Return the subtask that is due at every frame: the phase `ahead` control steps later.
 
     It is never taken from another episode, nor from beyond the end of a visit that was broken off:
-    before an upset nothing shows that a return is near. With the first frame after it the label is
-    the phase that was returned to, and before where `contact` shows that the needle was lost and
-    the demonstrator had not noticed.
+    before an upset nothing shows that a return is near. From the first frame after that visit, the
+    label is the phase that was returned to. It is so earlier where `contact` shows that the needle
+    was lost and the demonstrator had not noticed yet.
 
     Args:
         phase: (N,) recorded phases.
-        step: (N,) control steps since each episode's beginning, rising in it.
-        episode_index: (N,) episode of every frame, rising.
+        step: (N,) control steps since each episode's beginning, ascending within it.
+        episode_index: (N,) episode of every frame, ascending.
         ahead: control steps.
         contact: (N,) whether the jaws hold the needle after each frame's action; None where it is
             not known.
@@ -97,7 +97,7 @@ def subtasks_due(
     for visit in range(len(limit) - 2, -1, -1):
         if found.is_finished[visit] and not found.ends_episode[visit]:
             limit[visit] = limit[visit + 1]
-    # Episode and step as one number that rises over all frames, with room for `ahead`.
+    # Episode and step as one number that increases over all frames, with room for `ahead`.
     episode = np.unique(episode_index, return_inverse=True)[1]
     time = episode * (int(step.max()) + ahead + 1) + step
     later = np.searchsorted(time, time + ahead)
@@ -117,18 +117,18 @@ def progress(
     episode_index: NDArray[np.int64],
     success: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """Return how much of its visit each frame has behind it, in [0, 1], or `UNKNOWN`.
+    """Return the share of its visit completed at each frame, in [0, 1], or `UNKNOWN`.
 
-    It rises evenly from 0 at a visit's first frame to 1 at the first frame that shows its success,
-    and stays there: τ = (t - s) / (e - s) of SARM (Chen et al., arXiv:2509.25358), as
-    `lerobot.rewards.sarm.sarm_utils.compute_tau` has it in LeRobot 0.6.1. The end e lies
-    `DWELL` - 1 control steps before the next visit's first frame, because a success must have held
-    for `DWELL` steps; in an episode's last visit it is what `success` says.
+    It rises linearly from 0 at a visit's first frame to 1 at the first frame that shows its
+    success, and stays there: τ = (t - s) / (e - s) of SARM (Chen et al., arXiv:2509.25358), as in
+    `lerobot.rewards.sarm.sarm_utils.compute_tau` of LeRobot 0.6.1. The end e is `DWELL` - 1 control
+    steps before the next visit's first frame, because a success must have held for `DWELL` steps;
+    in an episode's last visit, `success` gives the end.
 
     Args:
         phase: (N,) recorded phases.
-        step: (N,) control steps since each episode's beginning, rising in it.
-        episode_index: (N,) episode of every frame, rising.
+        step: (N,) control steps since each episode's beginning, ascending within it.
+        episode_index: (N,) episode of every frame, ascending.
         success: (N,) whether the step after each frame met the task (`names.SUCCESS`).
     """
     found = find_visits(phase, episode_index)
@@ -152,13 +152,13 @@ def stages(
 
     Args:
         columns: a dataset's columns.
-        episode_index: (N,) episode of every frame, rising.
+        episode_index: (N,) episode of every frame, ascending.
 
     Returns:
         (N, 2) float32: an index in `names.SUBTASKS`, and [0, 1] or `UNKNOWN`.
 
     Raises:
-        InputError: the task has no subtasks, or these are not all frames of their episodes.
+        InputError: the task has no subtasks, or the frames are not from whole procedures.
     """
     phase = np.asarray(columns[names.PHASE], np.int64)
     if len(phase) and not 0 <= phase.min() <= phase.max() < len(names.SUBTASKS):

@@ -28,7 +28,7 @@ CARD = EncoderCard(
 
 
 def build(card: EncoderCard, path: Path | None) -> tuple[EncoderCard, nn.Module]:
-    """Return the network of (B, 3, 224, 224) normalised images → (B, 192)."""
+    """Return the network: (B, 3, 224, 224) normalised images → (B, 192)."""
     return card, nn.Sequential(nn.AvgPool2d(SIDE // SQUARES), nn.Flatten())
 
 

@@ -11,7 +11,7 @@ from surgicai_vision.core import names
 
 @final
 class LinearPolicy(Policy):
-    """One layer without an activation."""
+    """One linear layer without an activation."""
 
     def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
         super().__init__(Inputs(visual, (names.STATE,) if recipe.proprioception else ()))

@@ -1,8 +1,8 @@
-"""`touch_point`: touch a marked point with the needle's tip, and the expert that does it.
+"""`touch_point`: touch a marked point with the needle's tip; and the expert that does it.
 
 The point lies along the wound from the stitch's entry: in the default scene it is the next entry
-hole, which every camera sees. PSM2 holds the needle, which lies on the tissue when an episode
-starts. Success: the tip is within 2 mm of the point, in any orientation, and the jaws hold the
+hole, which every camera sees. When an episode starts, PSM2 holds the needle, which lies on the
+tissue. Success: the tip is within 2 mm of the point, in any orientation, and the jaws hold the
 needle.
 """
 
@@ -26,7 +26,7 @@ from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import geodesic_angle
 
 NEXT = np.array([0.0, -0.0235, 0.0])
-"""From the stitch's entry to the marked point in world [m]: to the second hole pair of `simple`."""
+"""From the stitch's entry to the marked point [m, world]: the second hole pair of `simple`."""
 CLEAR = 0.004
 """Height of the needle's lowest point over the tissue at which it may turn [m]."""
 HOVER = 0.006

@@ -1,4 +1,4 @@
-"""`dataset`: commands on a dataset that exists, one module each."""
+"""`dataset`: commands on an existing dataset, one module each."""
 
 from types import MappingProxyType
 

@@ -22,7 +22,7 @@ class Options:
     """Options of `dataset check`.
 
     Attributes:
-        dataset: A dataset that render-demos made; lerobot-salvage checks any other.
+        dataset: Folder of a dataset made by render-demos; lerobot-salvage checks any other.
     """
 
     dataset: Annotated[Path, DIRECTORY] = field(kw_only=False)
@@ -30,7 +30,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Print one line a problem; the exit code is 1 when there is one."""
+    """Print one line per problem; the exit code is 1 if there is one."""
     from surgicai_vision.dataset import check_dataset
 
     with console.stage("checking") as progress:

@@ -27,10 +27,10 @@ class Options:
     """Options of `dataset convert`.
 
     Attributes:
-        dataset: A dataset of ours.
-        view: Views to take.
-        workers: Processes that encode videos.
-        out: Dataset to make.
+        dataset: Folder of a dataset made by this product.
+        view: Views to keep.
+        workers: Number of processes that encode videos.
+        out: Folder of the new dataset.
     """
 
     dataset: Annotated[Path, DIRECTORY] = field(kw_only=False)

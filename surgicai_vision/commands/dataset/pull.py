@@ -24,9 +24,9 @@ class Options:
     """Options of `dataset pull`.
 
     Attributes:
-        repo: A dataset on the Hub that dataset push shared.
-        out: Folder to make.
-        revision: Branch, tag or commit.
+        repo: A dataset on the Hub, shared by `dataset push`.
+        out: Folder to create.
+        revision: Branch, tag or commit to fetch.
     """
 
     repo: Annotated[str, Parameter(metavar="USER/NAME")] = field(kw_only=False)

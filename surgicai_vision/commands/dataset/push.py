@@ -23,10 +23,10 @@ class Options:
     """Options of `dataset push`.
 
     Attributes:
-        dataset: A dataset of ours.
-        repo: Where to; made when it does not exist.
-        private: Make it private.
-        licence: The Hub's short name of a licence.
+        dataset: Folder of a dataset made by this product.
+        repo: Repository to push to; created if it does not exist.
+        private: If the repository is created, make it private.
+        licence: Licence of the dataset, by its short name on the Hub.
         dry_run: Show the card and upload nothing.
     """
 

@@ -24,9 +24,9 @@ class Options:
     """Options of `policy pull`.
 
     Attributes:
-        repo: A policy on the Hub that was pushed by `policy push`.
-        out: Folder to make.
-        revision: Branch, tag or commit.
+        repo: A policy on the Hub, shared by `policy push`.
+        out: Folder to create.
+        revision: Branch, tag or commit to fetch.
     """
 
     repo: Annotated[str, Parameter(metavar="USER/NAME")] = field(kw_only=False)

@@ -30,10 +30,10 @@ class Options:
 
     Attributes:
         policy: A checkpoint folder, or released:NAME.
-        repo: Where to; made when it does not exist.
-        evaluation: Folder of an evaluation of this policy, whose successes the card tells.
-        private: Make it private.
-        licence: The Hub's short name of a licence.
+        repo: Repository to push to; created if it does not exist.
+        evaluation: Folder of an evaluation of this policy; the card states its successes.
+        private: If the repository is created, make it private.
+        licence: Licence of the policy, by its short name on the Hub.
         dry_run: Show the card and upload nothing.
     """
 
@@ -70,7 +70,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
 
 def _successes(folder: Path, checkpoint: "Checkpoint") -> "Successes":
-    """Return what an evaluation counted.
+    """Return the successes of an evaluation.
 
     Raises:
         InputError: it is of another policy.

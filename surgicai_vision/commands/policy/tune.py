@@ -1,4 +1,4 @@
-"""`policy tune`: choose how sure and how patient the ends of a hierarchical policy are."""
+"""`policy tune`: choose when a hierarchical policy with learned ends ends a subtask."""
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -42,12 +42,12 @@ class Options:
 
     Attributes:
         policy: The YAML file of a hierarchical policy with learned ends.
-        confidence: Probabilities that another subtask must have.
-        patience: How often in a row it must be named.
-        episodes: Number of validation starts, the same for all pairs.
+        confidence: Values to try: probability that another subtask needs to end the present one.
+        patience: Values to try: times in a row that the other subtask must be named.
+        episodes: Number of validation starts, the same for every pair of values.
         seed: Seed of the first start; each episode takes the next.
         workers: Number of processes.
-        out: Folder to make or to continue; its hierarchical.yaml has the chosen values.
+        out: Folder to create or continue; its hierarchical.yaml has the chosen values.
     """
 
     policy: Annotated[Path, Parameter(metavar="FILE")] = field(kw_only=False)

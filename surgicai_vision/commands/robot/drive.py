@@ -69,19 +69,19 @@ class Options:
         policy: A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`) or
             module:factory.
         task: The task.
-        send: Send what the policy says; otherwise print what would be sent.
-        simulated: The robot is `robot serve`, which begins episodes and judges them.
-        clock: real, or stepped where the simulation is served with --clock stepped.
-        dead_man: What a person holds: key (the space bar), the topic of a sensor_msgs/Joy, or, at
-            a served simulation alone, none.
-        episodes: Episodes at a served simulation.
+        send: Send the policy's commands to the robot; otherwise only print them.
+        simulated: The robot is a simulation of `robot serve`, which starts and judges episodes.
+        clock: real, or stepped if the simulation is served with --clock stepped.
+        dead_man: Dead-man's switch that a person holds: key (the space bar), the topic of a
+            sensor_msgs/Joy, or none, for a served simulation only.
+        episodes: With --simulated, the number of episodes.
         seed: Seed of the first start.
-        seconds: Longest time of an episode [s].
-        compressed: Read the compressed images, not the raw ones.
-        transport: What carries the messages.
-        interface: See above.
-        domain: See above.
-        out: Folder of the log, which grows.
+        seconds: Time limit of an episode [s].
+        compressed: Read the compressed images instead of the raw ones.
+        transport: Middleware that carries the messages.
+        interface: See `network.INTERFACE`.
+        domain: See `network.Domain`.
+        out: Folder of the log; new episodes are appended.
     """
 
     policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
@@ -115,7 +115,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Drive, and print what was sent, what was held back, and how late it came."""
+    """Drive, and print how many steps were sent or held back, and how late."""
     from surgicai_vision.demos.imports.rosbag.config import Frames
     from surgicai_vision.robot.driver import DriveConfig, check_drivable
     from surgicai_vision.robot.guards import GuardConfig
@@ -154,17 +154,17 @@ def _driver(
     stack: ExitStack,
     console: Console,
 ) -> "Driver":
-    """Return what drives the robot, connected to it, with its log begun.
+    """Return the driver, connected to the robot, with its log begun.
 
     Args:
-        options: the command's.
-        spec: what drives.
+        options: the command's options.
+        spec: the policy that drives.
         agent: its agent.
         config: how it drives.
-        frames: where the robot's frames are, where not as ours.
+        frames: the robot's frames, where they differ from ours.
         out: the log's folder.
         stack: closes what is opened.
-        console: told what a dry run would send.
+        console: prints what a dry run would send.
     """
     from surgicai_vision.core.files import code_version
     from surgicai_vision.robot.arm import FINGER_SHARE
@@ -205,7 +205,7 @@ def _driver(
 def _drive(
     driver: "Driver", options: Options, task: TaskConfig, console: Console
 ) -> "list[DrivenEpisode]":
-    """Drive the episodes that are asked for, or until Ctrl-C; return those that ended."""
+    """Drive the requested episodes, or until Ctrl-C; return those that ended."""
     limit = task.max_steps
     if options.seconds is not None:
         limit = max(1, round(options.seconds * names.FPS))
@@ -234,7 +234,7 @@ def _told(
     log: Path,
     console: Console,
 ) -> dict[str, object]:
-    """Print how late was sent and how many episodes succeeded; return it with each episode."""
+    """Print the latencies and how many episodes succeeded; return these and each episode."""
     import numpy as np
 
     late = [value for episode in episodes for value in episode.latencies]
@@ -274,10 +274,10 @@ def _told(
 
 
 def _dead_man(options: Options, transport: "Transport", stack: ExitStack) -> "Callable[[], float]":
-    """Return what says for how long the dead-man's switch was not held [s].
+    """Return a function that says for how long the dead-man's switch was not held [s].
 
     Raises:
-        InputError: none at a robot, or something that is no switch.
+        InputError: "none" for a real robot, or something that is not a switch.
     """
     from surgicai_vision.robot.dead_man import HeldKey, HeldPedal
 
@@ -294,5 +294,5 @@ def _dead_man(options: Options, transport: "Transport", stack: ExitStack) -> "Ca
 
 
 def _about(seed: int, options: Options) -> str:
-    """Return what an episode is called."""
+    """Return how messages name an episode."""
     return f"start {seed}" if options.simulated else "the run"

@@ -13,13 +13,13 @@ from surgicai_vision.robot.transport import TRANSPORTS
 
 TRANSPORT = Parameter(choices=tuple(TRANSPORTS))
 INTERFACE = Parameter(
-    help="Network interface that is used and heard, and no other; lo is this machine alone.",
+    help="The only network interface to use; lo reaches this machine only.",
     metavar="NAME",
 )
 Domain = Annotated[
     int | None,
     Parameter(
-        help="ROS's domain number, 0 to 232.",
+        help="ROS domain number, 0 to 232.",
         metavar="N",
         show_default=lambda _: "ROS_DOMAIN_ID, else 0",
     ),
@@ -28,7 +28,7 @@ Domain = Annotated[
 
 
 def ros_domain(given: int | None) -> int:
-    """Return the domain number that was given, else that of ROS's own variable, else 0.
+    """Return the given domain number, else that of ROS's own variable, else 0.
 
     Raises:
         InputError: the variable holds no domain number.
@@ -42,5 +42,5 @@ def ros_domain(given: int | None) -> int:
 
 
 def renamed_topics(given: Mapping[str, object] | None) -> dict[str, str]:
-    """Return `topics:` of a file: topic of ours → the robot's own name of it."""
+    """Return the table `topics` of a file: our topic → the robot's name for it."""
     return {name: str(topic) for name, topic in (given or {}).items()}

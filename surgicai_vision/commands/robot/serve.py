@@ -52,20 +52,20 @@ class Options:
 
     Attributes:
         task: The task whose scene and starts are served.
-        seed: Seed of the first start; a client asks for others on /simulation/reset.
+        seed: Seed of the first start; a client requests others on /simulation/reset.
         clock: real, or stepped by the client on /simulation/step.
         view: Views whose images are published.
         size: Height and width of images [px].
-        image_rate: Images of each view a second at most, in real time [Hz].
-        compressed: Publish JPEG files besides the raw images.
-        advance: How the judge of the whole procedure goes on: by the present subtask's success, or
-            told on /simulation/enter, as a hierarchical policy with learned ends needs it.
-        record: Folder of demonstrations: keep every episode, from a reset to its success.
-        truth: Publish the needle's pose and the subtask under way, which no robot knows.
-        transport: What carries the messages.
-        interface: See above.
-        domain: See above.
-        seconds: End after so many simulated seconds.
+        image_rate: Highest rate of each view's images, in real time [Hz].
+        compressed: Publish JPEG files in addition to the raw images.
+        advance: How the judge of the whole procedure moves to the next subtask: by success, or when
+            told on /simulation/enter, as a hierarchical policy with learned ends needs.
+        record: Keep every episode, from a reset to its success, as a demonstration in this folder.
+        truth: Also publish the needle's pose and the present subtask, which no robot knows.
+        transport: Middleware that carries the messages.
+        interface: See `network.INTERFACE`.
+        domain: See `network.Domain`.
+        seconds: End after this many simulated seconds.
     """
 
     task: Annotated[str, TASK] = names.SUTURE
@@ -159,7 +159,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 
 
 def _task(options: Options) -> TaskConfig:
-    """Return the task; what is recorded may take the time that a person needs."""
+    """Return the task; recorded episodes may take the time that a person needs."""
     task = dataclasses.replace(task_config(options.task, options.env), advance=options.advance)
     if options.record is None or (options.env or {}).get("max_steps"):
         return task

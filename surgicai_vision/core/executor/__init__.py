@@ -1,17 +1,16 @@
-"""Executor: jobs by registered name, results in a store; the same command again is the resume.
+"""Executor: jobs by registered name, results in a store; the same command again resumes.
 
 A job is a registered function called as `function(folder, **arguments)`; it writes its result into
 `folder`, which is empty when it starts. The folder is committed to the store by one rename under
 the job's key, the sha256 over its name, its JSON arguments, the hashes of its inputs and the
-versions of the code it runs. The store is the truth and the processes are not: what is there is
-never computed again, whatever killed the run before. Results do not depend on the number of
-workers.
+versions of the code it runs. Only the store counts, not the processes: a result in it is never
+computed again, whatever killed an earlier run. Results do not depend on the number of workers.
 
     jobs = [Job("render-episode", {"demo": "…", "views": ["front"]}, inputs=(sha256,), weight=120)]
     folders = run(jobs, Path("out.work"), RunContext(workers=2))
 
-What runs the jobs is an engine: processes of this machine, Ray or Slurm (extras), or another
-distribution's.
+An engine runs the jobs: processes of this machine, Ray or Slurm (extras), or an engine of another
+distribution.
 """
 
 from surgicai_vision.core.executor.context import RunContext

@@ -1,4 +1,4 @@
-"""What a run works with, handed through as one value."""
+"""What a run works with, passed along as one value."""
 
 import os
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from surgicai_vision.core.progress import Stage, silent_stage
 @final
 @dataclass(frozen=True)
 class RunContext:
-    """What a run works with: it changes how long the run takes and never what it gives.
+    """What a run works with: it changes how long the run takes, never its results.
 
     Attributes:
-        workers: processes at a time; 0 works in this process, None takes one for each core.
+        workers: processes at a time; 0 works in this process, None takes one per core.
         engine: what runs the jobs.
         stage: opens the display of each stage.
     """
@@ -30,6 +30,6 @@ class RunContext:
             raise InputError(f"workers is {self.workers}; it must be 0 (this process) or more.")
 
     def processes(self, most: int | None = None) -> int:
-        """Return how many processes to start, `most` being all there is work for."""
+        """Return how many processes to start; there is work for `most` of them."""
         count = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
         return count if most is None else min(count, most)

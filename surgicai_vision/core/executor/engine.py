@@ -1,11 +1,13 @@
-"""Engines: what runs jobs. A table of them; another distribution adds its own by an entry point.
+"""Engines: what runs jobs.
 
-class MyEngine(Engine):
-name = "mine"
-def execute(self, tasks, workers, attempts=None): …
+Another distribution adds its own through an entry point:
 
-[project.entry-points."surgicai_vision.engines"]
-mine = "my_package:MyEngine"
+    class MyEngine(Engine):
+        name = "mine"
+        def execute(self, tasks, workers, attempts=None): …
+
+    [project.entry-points."surgicai_vision.engines"]
+    mine = "my_package:MyEngine"
 """
 
 from abc import ABC, abstractmethod
@@ -17,15 +19,15 @@ from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.core.executor.jobs import Job, Task
 
 Ending = tuple[str, SurgicaiError | None]
-"""A job's key, and the error that it ended in; None where its result is committed."""
+"""A job's key, and the error that it ended in; None if its result is committed."""
 
 
 @dataclass(frozen=True)
 class Engine(ABC):
-    """Runs jobs; it never decides what they give.
+    """Runs jobs; it never affects their results.
 
     An engine is a frozen dataclass whose fields are its options. It calls `jobs.perform` for each
-    task, in whatever process, and relies on the store alone: a committed folder is a job done.
+    task, in any process, and relies only on the store: a job whose folder is committed is done.
 
     Attributes:
         name: its key in the table.
@@ -39,12 +41,12 @@ class Engine(ABC):
     ) -> Generator[Ending]:
         """Do the tasks; yield each key as its result is committed, or with the job's error.
 
-        The caller closes the generator; whatever still runs then is ended.
+        The caller closes the generator; tasks that still run then are ended.
 
         Args:
             tasks: key → task.
             workers: how many run at once.
-            attempts: how often a job is started whose worker dies; None is the engine's own number.
+            attempts: how often to start a job whose worker dies; None is the engine's default.
         """
 
 

@@ -1,7 +1,9 @@
 """The table of engines, by their names on the command line.
 
-open_engine("local")
-open_engine("slurm,partition=cpu,minutes=60")
+For example:
+
+    open_engine("local")
+    open_engine("slurm,partition=cpu,minutes=60")
 """
 
 import dataclasses
@@ -29,7 +31,7 @@ def register_engine(engine: type[Engine]) -> None:
 
     Raises:
         NameCollision: the name is taken.
-        InputError: this is no engine.
+        InputError: this is not an engine.
     """
     name = getattr(engine, "name", shown(engine))
     owner = getattr(engine, "__module__", "").partition(".")[0]

@@ -26,7 +26,7 @@ F = TypeVar("F", bound=Callable[..., None])
 
 @dataclass(frozen=True)
 class JobKind:
-    """What a job's name stands for.
+    """What a job's name refers to.
 
     Attributes:
         function: "module:function", imported in the worker on first use.
@@ -42,7 +42,7 @@ class JobKind:
 _kinds: dict[str, JobKind] = {}
 
 JOBS: Mapping[str, JobKind] = MappingProxyType(_kinds)
-"""Name → what it stands for, as far as modules that register jobs are imported."""
+"""Name → what it refers to, for the jobs of modules imported so far."""
 
 
 def register_job(
@@ -55,14 +55,14 @@ def register_job(
     """Register a job whose function is not imported yet.
 
     Args:
-        name: what jobs of this kind are called, once in all.
+        name: name of the jobs of this kind, which must be unique.
         function: "module:function", called as `function(folder, **arguments)`.
-        stages: the packages of surgicai_vision whose sources decide the result, or a family beside
-            it ("encoders", "policies"); core's names and config always count.
+        stages: the packages of surgicai_vision whose sources decide the result, or a family next
+            to it ("encoders", "policies"); the modules `core.files.SHARED` always count.
         packages: distributions whose versions decide the result.
 
     Raises:
-        InputError: the name stands for another function already.
+        InputError: the name already refers to another function.
     """
     kind = JobKind(function, stages, packages)
     known = _kinds.setdefault(name, kind)
@@ -95,9 +95,9 @@ class Job:
         name: a registered name.
         arguments: JSON data, the function's keyword arguments.
         inputs: hashes of what the job reads besides its arguments.
-        weight: what it counts for in the progress.
-        label: names of arguments that are left out of the key: where a file lies does not change
-            what it holds.
+        weight: its weight in the progress.
+        label: names of arguments that are left out of the key, such as the path of a file, which
+            does not change its content.
     """
 
     name: str
@@ -108,10 +108,10 @@ class Job:
 
     @property
     def kind(self) -> JobKind:
-        """Return what the name stands for.
+        """Return what the name refers to.
 
         Raises:
-            UnknownName: nothing that was imported registers it.
+            UnknownName: no imported module registers it.
         """
         return _kinds[check_name("job", self.name, _kinds)]
 
@@ -145,7 +145,7 @@ def _version(package: str) -> str:
 
 @dataclass(frozen=True)
 class Task:
-    """A job to be done: what an engine is handed.
+    """A job to do, as an engine receives it.
 
     Attributes:
         job: the job, for messages.
@@ -158,21 +158,21 @@ class Task:
     destination: Path
 
     def do(self) -> Failure | None:
-        """Do the job in this process; return how it failed."""
+        """Do the job in this process; return its failure, if any."""
         return perform(self.function, dict(self.job.arguments), str(self.destination))
 
 
 def perform(function: str, arguments: dict[str, JSON], destination: str) -> Failure | None:
-    """Do one job and commit its result; the function that every engine runs in its workers."""
+    """Do one job and commit its result; every engine runs this function in its workers."""
     target = Path(destination)
-    if target.is_dir():  # its worker was killed after the commit and before it could say so
+    if target.is_dir():  # its worker was killed after the commit, before it could report it
         return None
     try:
         module, _, name = function.partition(":")
         with whole_folder(target) as folder:
             getattr(importlib.import_module(module), name)(folder, **arguments)
     except Exception as error:
-        if target.is_dir():  # somebody else committed the same result first
+        if target.is_dir():  # another process committed the same result first
             return None
         return Failure.of(error)
     return None

@@ -1,7 +1,7 @@
 """The local engine: spawned processes on this machine, or none.
 
-Each worker is on its own: one that dies (killed, out of memory) is replaced, its job is tried
-again, and the others go on.
+Workers are independent: one that dies (killed, out of memory) is replaced, its job is tried again,
+and the others continue.
 """
 
 from collections import Counter
@@ -15,10 +15,10 @@ from surgicai_vision.core.executor.jobs import Task, perform
 from surgicai_vision.core.processes import OFFLINE, ONE_THREAD, Died, Done, Failure, Worker
 
 ATTEMPTS = 2
-"""How often a job is started whose worker dies, where the caller does not say."""
+"""How often to start a job whose worker dies, unless the caller says."""
 
 VARIABLES: Mapping[str, str] = {**ONE_THREAD, **OFFLINE}
-"""Environment of a worker: one core, and no network, since what a job needs is its input."""
+"""Environment of a worker: one core, and no network, since a job needs only its inputs."""
 
 
 @final
@@ -50,7 +50,7 @@ LOCAL = LocalEngine()
 
 @final
 class _Crew:
-    """The workers of a run, and the queue that they work off."""
+    """The workers of a run, and the queue that they work through."""
 
     def __init__(self, tasks: Mapping[str, Task], workers: int, attempts: int):
         self._tasks = tasks
@@ -62,7 +62,7 @@ class _Crew:
         self._busy: dict[Worker, str] = {}
 
     def work(self) -> Generator[Ending]:
-        """Work off the queue."""
+        """Work through the queue."""
         while self._queue or self._busy:
             while self._queue and len(self._busy) < self._workers:
                 self._begin(self._queue.pop(0))
@@ -71,7 +71,7 @@ class _Crew:
                 yield from self._hear(worker)
 
     def dismiss(self) -> None:
-        """Let the idle workers leave in order."""
+        """Let the idle workers exit cleanly."""
         for worker in self._idle:
             worker.dismiss()
 
@@ -81,7 +81,7 @@ class _Crew:
             worker.end()
 
     def _begin(self, key: str) -> None:
-        """Hand a task to an idle worker, or to a new one where there is none."""
+        """Hand a task to an idle worker, or to a new one if none is idle."""
         task = self._tasks[key]
         worker = self._idle.pop() if self._idle else Worker(VARIABLES)
         self._busy[worker] = key
@@ -89,7 +89,7 @@ class _Crew:
         worker.call(perform, task.function, dict(task.job.arguments), str(task.destination))
 
     def _hear(self, worker: Worker) -> Generator[Ending]:
-        """Take what a worker says; one that died is dropped and its job tried again."""
+        """Receive a worker's message; drop a worker that died and try its job again."""
         key = self._busy[worker]
         job = self._tasks[key].job
         try:

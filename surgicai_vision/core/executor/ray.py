@@ -1,8 +1,8 @@
 """The Ray engine: jobs as tasks of Ray Core, on this machine or on a cluster.
 
-A cluster of its own listens on loopback only, without a dashboard and without reports of use. Ray
-starts a task again whose worker or node was lost; its result is committed by one rename, so that a
-task done twice is there once. What is committed counts, whatever becomes of Ray.
+A cluster started here listens on loopback only, without a dashboard or usage reports. Ray restarts
+a task whose worker or node was lost; its result is committed by one rename, so a task that ran
+twice has one result. What is committed counts, whatever happens to Ray.
 """
 
 import functools
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from ray import ObjectRef
 
 ATTEMPTS = 5
-"""How often Ray starts a task whose worker or node is lost, where the caller does not say."""
+"""How often Ray starts a task whose worker or node is lost, unless the caller says."""
 
 OBJECT_STORE = 80 * 2**20
-"""Bytes of Ray's shared memory, its least: results are files, and nothing of size is passed."""
+"""Bytes of Ray's shared memory, its minimum: results are files, and nothing large is passed."""
 
 CLUSTER_VARIABLES: Mapping[str, str] = {
     **VARIABLES,
@@ -36,8 +36,8 @@ CLUSTER_VARIABLES: Mapping[str, str] = {
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
 }
 """Set while Ray starts, and so in its workers. The last one, read on Ray's import (ray 2.60,
-_private/ray_constants.py), makes every one of its servers listen on 127.0.0.1 alone; without it
-they listen on all interfaces. A cluster of several nodes is started by its owner and given by
+_private/ray_constants.py), makes all its servers listen on 127.0.0.1 only; without it they
+listen on all interfaces. A cluster of several nodes is started by its owner and given by its
 address."""
 
 
@@ -48,7 +48,7 @@ class RayEngine(Engine):
 
     Attributes:
         address: of a running cluster whose nodes see the store under the same path, as HOST:PORT;
-            None starts Ray on this machine alone.
+            None starts Ray on this machine only.
     """
 
     name: ClassVar[str] = "ray"
@@ -87,7 +87,7 @@ class RayEngine(Engine):
 
 
 def _perform(function: str, arguments: dict[str, JSON], destination: str) -> Failure | None:
-    """Do one job in a worker of Ray; a cluster of several nodes has an environment of its own."""
+    """Do one job in a worker of Ray; a cluster of several nodes has its own environment."""
     with environment(VARIABLES):
         return perform(function, arguments, destination)
 
@@ -95,7 +95,7 @@ def _perform(function: str, arguments: dict[str, JSON], destination: str) -> Fai
 def _error(
     ray: ModuleType, reference: "ObjectRef[Failure | None]", task: Task, times: int
 ) -> SurgicaiError | None:
-    """Return what a task ended in: None where its result is committed."""
+    """Return the error that a task ended in; None if its result is committed."""
     try:
         failure: Failure | None = ray.get(reference)
     except ray.exceptions.RayError as error:

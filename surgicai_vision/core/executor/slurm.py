@@ -1,10 +1,9 @@
 """The Slurm engine: jobs as batch jobs of a cluster, submitted by submitit.
 
-The nodes see the store and this Python environment under the same paths. Up to `workers` jobs are
-submitted at a time, each with one core. One that is killed, preempted or over its time is submitted
-again; its result is committed by one rename, so that a job done twice is there once. A run that is
-interrupted cancels its jobs. One that is killed cannot: what they commit by then is found by the
-next run.
+The nodes must see the store and this Python environment under the same paths. Up to `workers` jobs
+are submitted at a time, each with one core. One that is killed, preempted or over its time is
+submitted again; its result is committed by one rename, so a job that ran twice has one result. An
+interrupted run cancels its jobs. A killed run cannot; the next run finds what they committed.
 """
 
 import importlib.util
@@ -26,13 +25,13 @@ if TYPE_CHECKING:
     import submitit
 
 ATTEMPTS = 3
-"""How often a job is submitted that ends without a result, where the caller does not say."""
+"""How often to submit a job that ends without a result, unless the caller says."""
 
 POLL_S = 0.5
-"""How often the store is looked at [s]; submitit asks Slurm itself far less often."""
+"""Interval between looks at the store [s]; submitit asks Slurm itself far less often."""
 
 GRACE_S = 15.0
-"""Longest that a network file system may take to show the result of a job that has ended [s]."""
+"""Longest time a network file system may take to show the result of a job that ended [s]."""
 
 CLUSTERS = ("slurm", "local", "debug")
 
@@ -47,12 +46,12 @@ class SlurmEngine(Engine):
 
     Attributes:
         partition: where the jobs run; None is the cluster's default.
-        account: who pays; None is the user's default.
-        minutes: longest time of a job [min].
+        account: account to charge; None is the user's default.
+        minutes: time limit of a job [min].
         memory_gb: memory of a job [GB]; None is the cluster's default.
         gpus: GPUs of a job.
-        cluster: "slurm"; "local" makes a process of each job and "debug" runs them in this one, to
-            try the engine on a machine without Slurm.
+        cluster: "slurm"; "local" runs each job as a process and "debug" in this process, to try
+            the engine on a machine without Slurm.
     """
 
     name: ClassVar[str] = "slurm"
@@ -86,7 +85,7 @@ class SlurmEngine(Engine):
         queue = _Queue(tasks, self._executor(store), max(1, workers), attempts or ATTEMPTS)
         try:
             yield from queue.work()
-            if not queue.lost:  # else the message names its output
+            if not queue.lost:  # else the message names an output file in it
                 shutil.rmtree(store / SUBMISSIONS, ignore_errors=True)
         finally:
             queue.cancel()
@@ -115,7 +114,7 @@ class SlurmEngine(Engine):
 
 @final
 class _Queue:
-    """The jobs of a run: those to be submitted and those that the cluster has.
+    """The jobs of a run: those still to be submitted and those on the cluster.
 
     Attributes:
         lost: whether a job ended without a result at every attempt.
@@ -149,7 +148,7 @@ class _Queue:
                 time.sleep(POLL_S)
 
     def cancel(self) -> None:
-        """Cancel what the cluster still has."""
+        """Cancel the jobs that are still on the cluster."""
         for job in self._running.values():
             job.cancel(check=False)
 
@@ -162,7 +161,7 @@ class _Queue:
         self._submitted[key] += 1
 
     def _look(self, key: str) -> Generator[Ending]:
-        """Yield a job that has ended; submit one again that ended without a result."""
+        """Yield a job that has ended; resubmit one that ended without a result."""
         task = self._tasks[key]
         job = self._running[key]
         over = job.done()
@@ -187,9 +186,9 @@ class _Queue:
 
 
 def _error(job: "submitit.Job[Failure | None]", task: Task) -> SurgicaiError | None:
-    """Return what a job that has answered ended in."""
+    """Return the error of a job that has answered; None if it succeeded."""
     broken = job.exception()
-    if broken is not None:  # it did not come as far as our function
+    if broken is not None:  # it failed before our function was called
         error = SurgicaiError(
             f"{task.job} could not be started; its output is in {job.paths.stderr}"
         )

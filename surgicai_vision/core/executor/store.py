@@ -1,6 +1,6 @@
-"""Run jobs against a store: what is there is never computed again.
+"""Run jobs against a store: a result that is in it is never computed again.
 
-What is missing is done by an engine and committed whole.
+An engine computes the missing results, which are committed whole.
 """
 
 import os
@@ -19,7 +19,7 @@ Ended = Callable[[Job, Path, SurgicaiError | None], None]
 """Called as `ended(job, folder, error)`; without an error the folder holds the job's result."""
 
 LOCK = ".lock"
-"""File in a store that its run holds locked."""
+"""File in a store that its run keeps locked."""
 
 
 def run(
@@ -36,13 +36,13 @@ def run(
 
     Args:
         jobs: what to do.
-        store: folder of results; made when missing.
+        store: folder of results; created if missing.
         context: workers (0 does the jobs in this process) and engine.
         progress: counts the jobs' weights.
         unit: what the weights count ("frames").
-        attempts: how often a job is started whose worker dies; None is the engine's own number.
-        ended: called for every job of this run as it ends; then a job that fails does not end the
-            run.
+        attempts: how often to start a job whose worker dies; None is the engine's default.
+        ended: called for every job of this run as it ends; if given, a job that fails does not end
+            the run.
 
     Raises:
         InputError: an unknown job, a store in use by another run, or bad input to a job.
@@ -69,12 +69,12 @@ def run(
 
 
 _claimed: set[Path] = set()
-"""Stores this process holds; a claim inside a claim is the same one."""
+"""Stores that this process holds; nested claims are one claim."""
 
 
 @contextmanager
 def claim(store: Path) -> Iterator[None]:
-    """Hold a store alone, and clear what a killed run left unfinished in it.
+    """Hold a store exclusively, and clear what a killed run left unfinished in it.
 
     Raises:
         InputError: another process holds it.
@@ -96,17 +96,17 @@ def claim(store: Path) -> Iterator[None]:
 
 
 def work_folder(out: Path) -> Path:
-    """Return the store in which `out` is built: beside it, on the same file system."""
+    """Return the store in which `out` is built: next to it, on the same file system."""
     return out.with_name(f"{out.name}.work")
 
 
 @contextmanager
 def building(out: Path) -> Iterator[tuple[Path, Path]]:
-    """Build the folder `out` so that it appears whole, with the store of its jobs beside it.
+    """Build the folder `out` so that it appears whole, with the store of its jobs next to it.
 
-    Yields the store, for `run`, and a path in it for the result, to be made with
+    Yields the store, for `run`, and a path in it for the result, to be created with
     `files.whole_folder`. At the end the result becomes `out` by one rename and the store is
-    removed; after an error or a kill the store stays, and the next run goes on with what it holds.
+    removed; after an error or a kill the store stays, and the next run continues from it.
 
         with building(out) as (store, result):
             shards = run(jobs, store, context)

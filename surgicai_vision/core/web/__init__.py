@@ -1,6 +1,6 @@
-"""Web: pages that this machine's own browser opens, and nobody else.
+"""Web: pages for a browser on this machine only.
 
 * `server`: a server on loopback behind a random token.
-* `screen`: the newest images and status, handed from the thread that works to those that serve.
+* `screen`: the newest images and status, passed from the working thread to the serving threads.
 * `site`: a page about both, with `base.css` and `screen.js`, which all such pages load.
 """

@@ -1,4 +1,4 @@
-"""Screen: the newest images and status, passed from the thread that works to a server's threads."""
+"""Screen: the newest images and status, passed from the working thread to a server's threads."""
 
 import dataclasses
 import threading
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 POLL_S = 1.0
-"""Time that a request for the next status waits at most [s]."""
+"""Longest time that a request for the next status waits [s]."""
 JPEG_QUALITY = 85
 
 Images = Mapping[str, NDArray[np.uint8]]
@@ -27,7 +27,7 @@ class PageScreen:
     again.
 
     Attributes:
-        watched: a page has asked for the status.
+        watched: a page has requested the status.
     """
 
     def __init__(self) -> None:

@@ -1,6 +1,6 @@
 """Server: a site on this machine's loopback, behind a token.
 
-`http://127.0.0.1:PORT/TOKEN/` and below it what a `Site` answers; `POST input` takes JSON.
+Addresses below `http://127.0.0.1:PORT/TOKEN/` serve what a `Site` answers; `POST input` takes JSON.
 
 Without the random token every answer is 404; a page of another site that knows the port is refused
 by its Host (DNS rebinding) and its Origin. Pages load nothing from elsewhere.
@@ -24,7 +24,7 @@ HOST = "127.0.0.1"
 HOST_NAMES = ("127.0.0.1", "localhost")
 """Names under which a browser, here or at the end of a tunnel, may address the server."""
 MAX_INPUT_BYTES = 4096
-"""Size of an input, at most [byte]."""
+"""Largest size of an input [byte]."""
 KINDS = MappingProxyType({".js": "text/javascript", ".css": "text/css"})
 HEADERS = MappingProxyType(
     {
@@ -39,25 +39,25 @@ HEADERS = MappingProxyType(
 )
 
 type Content = tuple[bytes, str]
-"""What stands at an address, and its type."""
+"""The content of an address, and its type."""
 
 
 class Site(Protocol):
     """What a server serves; its methods are called by the server's threads."""
 
     def answer(self, path: str, query: str) -> Content | None:
-        """Return what stands at an address below the token, or None."""
+        """Return the content of an address below the token, or None."""
 
     def receive(self, content: object) -> None:
-        """Take an input, decoded JSON; raise `InputError` if it is none."""
+        """Take an input, decoded JSON; raise `InputError` if it is invalid."""
 
 
 class PageServer:
-    """Serves a site from threads of its own, from `start` to `stop`.
+    """Serves a site from its own threads, from `start` to `stop`.
 
     Args:
         site: what it serves.
-        port: to listen at; 0 takes any.
+        port: port to listen on; 0 takes any free port.
 
     Raises:
         InputError: the port is not free.
@@ -87,7 +87,7 @@ class PageServer:
         ).start()
 
     def stop(self) -> None:
-        """Serve no more and free the port."""
+        """Stop serving and free the port."""
         self._server.shutdown()
         self._server.server_close()
 
@@ -108,7 +108,7 @@ class _Server(ThreadingHTTPServer):
         super().__init__((HOST, port), _Handler)
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Print nothing: a browser that leaves is no error."""
+        """Print nothing: a browser that disconnects is not an error."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -194,7 +194,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def version_string(self) -> str:
-        """Return no version."""
+        """Return the name without a version."""
         return "surgicai-vision"
 
 

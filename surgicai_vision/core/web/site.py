@@ -1,8 +1,8 @@
-"""Site: a page about images and a status that change.
+"""Site: a page that shows changing images and a changing status.
 
 Below the server's token:
 
-    GET  .                  the page; its scripts and style sheets beside it
+    GET  .                  the page; its scripts and style sheets are next to it
     GET  status?after=N     JSON: the status and the number of the newest images; waits for a status
                             after N
     GET  view/NAME.jpg      the newest image of a view
@@ -24,7 +24,7 @@ from surgicai_vision.core.web.server import Content, PageServer, page_file
 
 FOLDER = Path(__file__).parent
 SHARED = {name: FOLDER / name for name in ("base.css", "screen.js")}
-"""What every such page loads: how it looks, and how images and status come in."""
+"""What every such page loads: its style, and the script that fetches images and status."""
 LAST_S = 0.5
 """Time that open pages have to fetch the last status [s]."""
 
@@ -35,10 +35,10 @@ class ScreenSite:
 
     Attributes:
         html: the page.
-        files: name → a script or a style sheet beside it; `SHARED` is there already.
+        files: name → a script or a style sheet next to it; `SHARED` is always included.
         screen: its images and its status.
-        receive: takes an input; raises `InputError` for what is none.
-        answers: address → what returns its JSON for the number in its query `after`.
+        receive: takes an input; raises `InputError` if it is invalid.
+        answers: address → function that returns its JSON for the number in its query `after`.
     """
 
     html: bytes
@@ -48,7 +48,7 @@ class ScreenSite:
     answers: Mapping[str, Callable[[int], object]] = field(default_factory=dict)
 
     def answer(self, path: str, query: str) -> Content | None:
-        """Return what stands at an address below the token, or None."""
+        """Return the content of an address below the token, or None."""
         if path == "":
             return self.html, "text/html; charset=utf-8"
         files = {**SHARED, **self.files}
@@ -69,7 +69,7 @@ class ScreenPage:
 
     Args:
         site: the page.
-        port: to listen at; 0 takes any.
+        port: port to listen on; 0 takes any free port.
 
     Raises:
         InputError: the port is not free.
@@ -91,7 +91,7 @@ class ScreenPage:
 
 
 def render_page(template: Path, **values: object) -> bytes:
-    """Return a page from its template; text is escaped, and nothing may be left out."""
+    """Return a page from its template; text is escaped, and every value must be given."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(template.parent),
         autoescape=True,

@@ -5,15 +5,15 @@
     controller.reset()
     env.step(controller.action())
 
-The primitives (`fit`) run from the needle's measured start to the goal. Each step the needle's next
-pose becomes the tool's through the rigid grasp, measured anew each time, and the tool's becomes an
-action like the expert's. The primitive's clock stops while the command is more than one action
+The primitives (`fit`) run from the needle's measured start to the goal. At each step, the rigid
+grasp, measured anew each time, converts the needle's next pose to the tool's, which becomes an
+action as in the expert. The primitive's clock stops while the command is more than one action
 behind it (phase stopping of Ijspeert et al., all or nothing), so the path is kept whatever the step
 size. Demonstrations end as soon as they are within the tolerance; when the last primitive has run
 out, its goal becomes the subtask's own.
 
-Where the needle is grasped the tool runs relative to the grasp goal on the resting needle, jaws as
-open as the demonstration's before it closed, and closes when it has arrived.
+Where the needle is grasped, the tool moves relative to the grasp goal on the resting needle. Its
+jaws are as open as in the demonstration before closing, and close when the tool has arrived.
 """
 
 import functools
@@ -58,7 +58,7 @@ class DmpController(Demonstrator):
         fit: what was learned from the demonstrations.
 
     Raises:
-        BadFile: a file that is no demonstration.
+        BadFile: a file that is not a demonstration.
         InputError: no file, one of another task, or the whole procedure.
     """
 
@@ -164,5 +164,5 @@ def _split(pose: Matrix) -> tuple[Matrix, Matrix]:
 
 @functools.lru_cache(maxsize=8)
 def _fit_files(task: str, demos: tuple[str, ...], scaled: bool) -> SubtaskFit:
-    """Fit once per process."""
+    """Fit the primitives, once per process."""
     return fit_subtask(task, [read_demo(Path(path)) for path in demos], scaled)

@@ -7,12 +7,13 @@ where it is grasped (grasp, handoff) they move the tool relative to the frame in
 needle. Coordinates are those of the goal's frame, so a fit holds wherever the holes are.
 
 An insertion and a pull-out have two phases, because inside the tissue the phantom determines the
-path and it cannot be scaled: the start's error must be gone where the needle enters, so the first
-phase ends there and the second starts where the demonstration did; likewise the pull-out is split
-where the needle's base leaves the exit. In the second and the first of them the needle is
-`in_tissue`. A demonstration that there strays further from the path through the holes than the
-openings allow (SurgicAI's own do, by up to 10 mm: its tissue offered no resistance) is projected
-onto the path, turn by turn: it then determines the timing only (`SubtaskFit.projected`).
+path, which cannot be scaled. The start's error must be gone where the needle enters, so the first
+phase of an insertion ends there and the second starts where the demonstration did. Likewise the
+pull-out is split where the needle's base leaves the exit. The needle is `in_tissue` in the second
+phase of an insertion and the first of a pull-out. A demonstration may stray further from the path
+through the holes there than the openings allow (SurgicAI's own do, by up to 10 mm: its tissue
+offered no resistance). It is then projected onto the path, turn by turn, and determines the timing
+only (`SubtaskFit.projected`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -46,12 +47,12 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion, quaternion_to_
 Array = NDArray[np.float64]
 
 STRAIGHT_DURATION = 0.5
-"""Duration of a phase of which too few samples are left to learn a shape [s]."""
+"""Duration of a phase with too few samples left to learn a shape from [s]."""
 
 
 @dataclass(frozen=True)
 class DemoPoses:
-    """A demonstration as poses in world.
+    """A demonstration as poses in the world frame.
 
     Attributes:
         needle: T_world_needle, (T, 4, 4).
@@ -75,7 +76,7 @@ class CarryPhase:
     """A phase of a subtask in which the needle is carried.
 
     Attributes:
-        point: the frame that moves is the stitch's needle's at this angle [rad]; None: at its
+        point: angle on the stitch's needle of the frame that moves [rad]; None: the needle's
             origin, the arc's centre.
         goal: where that frame ends when the subtask is done perfectly, T_world_point (4, 4).
         end: index of the demonstration's last sample of the phase.
@@ -136,7 +137,7 @@ CARRY_PHASES: Mapping[str, tuple[CarryPhase, ...]] = MappingProxyType(
         ),
     }
 )
-"""Subtask → the phases in which its needle is carried; the other subtasks grasp the needle."""
+"""Subtask → the phases in which the needle is carried; the other subtasks grasp the needle."""
 
 
 @dataclass(frozen=True)
@@ -159,9 +160,9 @@ class SubtaskFit:
     Attributes:
         task: the subtask.
         phases: one per phase of `CARRY_PHASES`, or one where the needle is grasped.
-        grasp_angle: the point of a 120° needle that was grasped, of another one that at the same
-            share of its arc [rad]; where the needle is grasped.
-        jaw_opening: jaw angle before closing [rad]; where the needle is grasped.
+        grasp_angle: the grasped point on a 120° needle; on another needle, the point at the same
+            share of its arc [rad]. Only for subtasks that grasp the needle.
+        jaw_opening: jaw angle before closing [rad]. Only for subtasks that grasp the needle.
         projected: number of demonstrations that had to be projected onto the path through the
             holes.
     """
@@ -233,7 +234,7 @@ def _fit_carrying(task: str, demos: list[DemoPoses], scaled: bool) -> SubtaskFit
     goals: list[list[Array]] = [[] for _ in phases]
     projected = 0
     for demo in demos:
-        # Split the needle's path into the phases, and project what strays in the tissue.
+        # Split the needle's path into phases, and project those that stray in the tissue.
         paths = []
         first = 0
         for phase in phases:
@@ -249,7 +250,7 @@ def _fit_carrying(task: str, demos: list[DemoPoses], scaled: bool) -> SubtaskFit
             inverse = np.linalg.inv(phase.goal(demo.stitch))
             frame = phase.frame(demo.stitch)
             motions[index].append(as_motion(inverse @ paths[index] @ frame, demo.dt))
-            # A phase before one in the tissue ends where that one, projected or not, begins.
+            # A phase before one in the tissue ends where the latter, projected or not, begins.
             before_tissue = index + 1 < len(paths) and phases[index + 1].in_tissue
             end = paths[index + 1][0] if before_tissue else paths[index][-1]
             goals[index].append(inverse @ end @ frame)
@@ -261,7 +262,7 @@ def _fit_carrying(task: str, demos: list[DemoPoses], scaled: bool) -> SubtaskFit
 
 
 def _fit_phase(motions: list[Motion], goals: list[Array], scaled: bool) -> FittedPhase:
-    """Fit one phase, the motions' pauses left out."""
+    """Fit one phase to the motions without their pauses."""
     moving = [without_pauses(motion) for motion in motions]
     primitive = fit_primitive(moving, scaled=scaled)
     if max(map(len, moving)) < MIN_SAMPLES:
@@ -270,7 +271,7 @@ def _fit_phase(motions: list[Motion], goals: list[Array], scaled: bool) -> Fitte
 
 
 def _mean(nearby: list[Array]) -> Array:
-    """Return the mean of poses (4, 4) that are near each other."""
+    """Return the mean of poses (4, 4) that are close to each other."""
     first = matrix_to_quaternion(nearby[0][:3, :3])
     turns = [
         log_quaternion(multiply(matrix_to_quaternion(pose[:3, :3]), conjugate(first)))

@@ -5,8 +5,8 @@
     while not execution.done:
         execution.advance(0.02)  # execution.position, execution.rotation
 
-Position (Ijspeert et al., Neural Computation 25, 2013): a spring-damper pulled to the goal g and a
-learned force,
+Position (Ijspeert et al., Neural Computation 25, 2013): a spring-damper pulled to the goal g, plus
+a learned force,
 
     τ ż = α (β (g - y) - z) + f(x),   τ ẏ = z,   τ ẋ = -γ x,
     f(x) = a x Σψᵢwᵢ / Σψᵢ,   ψᵢ = exp(-hᵢ (x - cᵢ)²).
@@ -17,13 +17,13 @@ exponential,
     τ η̇ = α (β 2 log(g ∗ q̄) - η) + f(x),   τ q̇ = ½ η ∗ q.
 
 The weights come from locally weighted regression, jointly over the demonstrations. The papers leave
-the gains open; the usual ones are our choice: α = 25, β = α / 4 (critically damped), γ = α / 3, 80
-kernels with centres at equal times.
+the gains open; we use the usual ones: α = 25, β = α / 4 (critically damped), γ = α / 3, 80 kernels
+with centres at equal times.
 
-The amplitude a is 1 by default (Hoffmann et al., ICRA 2009): what a new start or goal adds decays
-or grows like the spring alone, the demonstrated shape stays as it is. With `scaled` it is the
-standard g - y₀, axis by axis, which needs an amplitude in every axis: a needle that only turns, or
-starts beside its goal, has none.
+The amplitude a is 1 by default (Hoffmann et al., ICRA 2009): the effect of a new start or goal
+decays or grows by the spring alone, and the demonstrated shape is unchanged. With `scaled` it is
+the standard g - y₀, axis by axis. That needs an amplitude in every axis, which a needle that only
+turns, or starts next to its goal, does not have.
 
 Quaternions are (w, x, y, z). Lengths are in metres, angles in radians, times in seconds.
 """
@@ -46,15 +46,15 @@ GAMMA = ALPHA / 3
 KERNELS = 80
 PAUSE_SPEED = 0.2e-3
 PAUSE_TURN_RATE = math.radians(0.1)
-"""Slower than both a sample is a pause [m/s, rad/s] (Zhou et al., ISMR 2024)."""
+"""A sample slower than both is a pause [m/s, rad/s] (Zhou et al., ISMR 2024)."""
 MIN_SAMPLES = 5
-"""Samples that a shape needs; from fewer only the way from start to goal is learned."""
+"""Samples needed for a shape; from fewer, only the motion from start to goal is learned."""
 DENSE_SAMPLES = 100
 """Fewest samples from which derivatives are taken."""
 MAX_INTEGRATION_STEP = 0.05
 """Largest α dt / τ of one integration step."""
 MIN_AMPLITUDE = 1e-6
-"""An axis of smaller amplitude has no shape to scale [m, rad]."""
+"""An axis with a smaller amplitude has no shape to scale [m, rad]."""
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
@@ -138,7 +138,7 @@ class Motion:
 def without_pauses(
     motion: Motion, slow: float = PAUSE_SPEED, slow_turn: float = PAUSE_TURN_RATE
 ) -> Motion:
-    """Return `motion` without its pauses, the samples slower than both limits [m/s, rad/s]."""
+    """Return `motion` without its pauses: samples slower than both limits [m/s, rad/s]."""
     steps = np.linalg.norm(np.diff(motion.position, axis=0), axis=1)
     turns = np.linalg.norm(
         log_quaternion(multiply(motion.rotation[1:], conjugate(motion.rotation[:-1]))), axis=1
@@ -150,7 +150,7 @@ def without_pauses(
 
 @dataclass(frozen=True)
 class Primitive:
-    """A fitted primitive; time, start and goal are chosen at `start`.
+    """A fitted primitive; duration, start and goal are chosen by `start`.
 
     Attributes:
         duration: mean duration of the demonstrations, τ [s].
@@ -180,7 +180,7 @@ class Primitive:
             rotation: of the start, unit quaternion (4,).
             goal_position: (3,).
             goal_rotation: unit quaternion (4,).
-            duration: τ [s]; None takes the demonstrations'.
+            duration: τ [s]; None uses the demonstrations'.
 
         Raises:
             InputError: a duration that is not positive.
@@ -227,7 +227,7 @@ class Execution:
 
     @property
     def done(self) -> bool:
-        """Return True if its time is over."""
+        """Return True once its duration has elapsed."""
         return self.elapsed >= self._tau - 1e-9
 
     def set_goal(self, goal: Array, goal_rotation: Array) -> None:
@@ -250,7 +250,7 @@ class Execution:
         self.elapsed += dt
 
     def _error(self) -> Array:
-        """Return the way to the goal, (6,): translation and rotation vector."""
+        """Return the error to the goal, (6,): translation and rotation vector."""
         turn = log_quaternion(multiply(self._goal_rotation, conjugate(self.rotation)))
         return np.concatenate([self._goal - self.position, turn])
 
@@ -294,7 +294,7 @@ def fit_primitive(
 
 
 def _dense(motion: Motion) -> Motion:
-    """Return `motion` with at least `DENSE_SAMPLES` samples, by splines, for good derivatives."""
+    """Return `motion` resampled by splines to at least `DENSE_SAMPLES`, for good derivatives."""
     if len(motion) >= DENSE_SAMPLES:
         return motion
     from scipy.interpolate import CubicSpline
@@ -319,7 +319,7 @@ def _forces(motion: Motion) -> tuple[Array, Array, Array]:
     shifts = np.diff(motion.position, axis=0)
     turns = log_quaternion(multiply(motion.rotation[1:], conjugate(motion.rotation[:-1])))
     between = np.concatenate([shifts, turns], axis=1) / step
-    # Speeds at the samples, from those half-way between: exact for a constant acceleration.
+    # Speeds at the samples, from those halfway between: exact for a constant acceleration.
     first = 1.5 * between[:1] - 0.5 * between[1:2]
     last = 1.5 * between[-1:] - 0.5 * between[-2:-1]
     speed = np.concatenate([first, (between[1:] + between[:-1]) / 2, last])
@@ -332,16 +332,16 @@ def _forces(motion: Motion) -> tuple[Array, Array, Array]:
 def _kernels(phase: Array, count: int) -> Array:
     """Return ψ at the phases, (T, count)."""
     centres, widths = _centres(count)
-    # The limit keeps the quotient of the sums finite far behind the last centre.
+    # The limit keeps the quotient of the sums finite far beyond the last centre.
     activations: Array = np.exp(-np.minimum(widths * (phase[:, None] - centres) ** 2, 500.0))
     return activations
 
 
 @functools.lru_cache(maxsize=8)
 def _centres(count: int) -> tuple[Array, Array]:
-    """Return centres c at equal times and widths h by the gap to the next centre, (count,) each.
+    """Return centres c at equal times and widths h from the gap to the next centre, (count,) each.
 
-    At the next centre a kernel has fallen to e⁻²: of the widths tried (e^-½ to e⁻⁴) the best at 60
+    At the next centre a kernel has fallen to e⁻²: the best of the widths tried (e^-½ to e⁻⁴) at 60
     samples and more.
     """
     centres = np.exp(-GAMMA * np.linspace(0.0, 1.0, count))

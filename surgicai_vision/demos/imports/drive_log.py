@@ -1,14 +1,14 @@
-"""Import of `robot drive`'s log: what a policy did at a robot, replayed in our scene.
+"""Import of `robot drive`'s log: what a policy did on a robot, replayed in our scene.
 
     summaries = import_drive_log(Path("outputs/drive/…/drive.jsonl"), task=None, out=Path("demos"))
 
-The log has one line a control step with both arms' measured poses in their bases and the subtask
-(`robot.driver`). An episode of it is read as a bag is (`rosbag.importer`): split into subtasks,
-freed of pauses and replayed. Control steps in which nothing was sent are left out where nothing was
-measured either. The log knows no needle: it is where the task's definition puts it, as in a bag
-without one.
+The log has one line per control step with both arms' measured poses in their bases and the subtask
+(`robot.driver`). Its episodes are read like a bag (`rosbag.importer`): split into subtasks, freed
+of pauses and replayed. A control step in which nothing was sent is left out if nothing was measured
+either. The log has no needle pose: the needle is where the task's definition puts it, as for a bag
+without a needle.
 
-Nothing in the file runs, and nothing but numbers is read from it.
+Nothing in the file is executed, and nothing but numbers is read from it.
 """
 
 import dataclasses
@@ -38,9 +38,9 @@ from surgicai_vision.demos.imports.rosbag.tracks import SegmentTrack, tracks_of
 from surgicai_vision.scene.rotations import matrix_to_quaternion_flat, rpy_to_matrix
 
 DEMONSTRATOR = "drive"
-"""Who demonstrates, as it is stored."""
+"""The demonstrator's name, as it is stored."""
 SEVEN = 7
-"""Numbers of an arm: x y z [m], roll pitch yaw, one finger's angle [rad]."""
+"""Numbers per arm: x y z [m], roll pitch yaw, one finger's angle [rad]."""
 MAX_STEP = 10**9
 """Largest control step that is read: more than half a year."""
 POSE = "geometry_msgs/PoseStamped"
@@ -52,11 +52,11 @@ class _Step:
     """One line of the log.
 
     Attributes:
-        run: which run of the command it is of.
-        seed: the episode's.
-        number: control step of the episode.
+        run: which run of the command it belongs to.
+        seed: the episode's seed.
+        number: control step in the episode.
         phase: number of the subtask.
-        arms: both arms' seven, psm1 first.
+        arms: both arms' seven numbers, psm1 first.
     """
 
     run: int
@@ -75,15 +75,15 @@ def import_drive_log(
     env: dict[str, object] | None = None,
     progress: Progress | None = None,
 ) -> list[BagSummary]:
-    """Import a log into folders of demonstrations, one a subtask.
+    """Import a log into folders of demonstrations, one per subtask.
 
     Args:
         path: the log.
-        task: the subtask that is wanted, into `out`; None: every one that is found, into
-            `out`/<task>.
-        out: folder to make; the same import of the same log finds it finished.
-        config: how to read it; topics, frames and jaw scale are a bag's.
-        env: fields of `TaskConfig`, among them the scene with its hole pair and instrument.
+        task: the requested subtask, written to `out`; None: every subtask that is found, written
+            to `out`/<task>.
+        out: folder to create; repeating the same import of the same log reuses it.
+        config: how to read the log; topics, frames and jaw scale are those of a bag.
+        env: fields of `TaskConfig`, including the scene with its hole pair and instrument.
         progress: called with (demonstrations done, demonstrations, "demonstrations").
 
     Raises:
@@ -115,7 +115,7 @@ def import_drive_log(
 
 
 def _steps(path: Path) -> Iterator[_Step]:
-    """Yield the control steps in which poses were measured; a line cut off at the end is left."""
+    """Yield the control steps in which poses were measured; an incomplete last line is ignored."""
     try:
         lines = path.read_text("utf-8").split("\n")[:-1]
     except (OSError, UnicodeDecodeError) as error:
@@ -147,7 +147,7 @@ def _steps(path: Path) -> Iterator[_Step]:
 
 
 def _arrays(episode: list[_Step]) -> Arrays:
-    """Return one episode's arrays, as `rosbag.reader.read` has them."""
+    """Return one episode's arrays, in the form of `rosbag.reader.read`."""
     time = np.array([step.number * 1_000_000_000 // names.FPS for step in episode], np.int64)
     arrays: dict[str, NDArray[np.generic]] = {"topics": np.array(["both_arms"], dtype=str)}
 
@@ -167,6 +167,6 @@ def _arrays(episode: list[_Step]) -> Arrays:
 
 
 def _pose(seven: NDArray[np.float64]) -> list[float]:
-    """Return x y z and a unit quaternion w x y z of an arm's seven."""
+    """Return x y z and a unit quaternion w x y z from an arm's seven numbers."""
     a, b, c, d, e, f, g, h, i = rpy_to_matrix(*seven[3:6].tolist()).ravel().tolist()
     return [*seven[:3].tolist(), *matrix_to_quaternion_flat((a, b, c, d, e, f, g, h, i))]

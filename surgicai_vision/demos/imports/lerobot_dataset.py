@@ -2,24 +2,24 @@
 
     summaries = import_dataset(Path("suturing"), task=None, out=Path("demos"))
 
-A LeRobot dataset of format v2.1 or v3 whose `observation.state` holds the poses of both arms, as
-Open-H-Embodiment and SutureBot publish them and `render-demos --layout open-h` writes them. An
-episode of it is read as a bag is (`rosbag.importer`): resampled to the control rate, split into
-subtasks, freed of pauses and replayed. Poses and labels are taken; images are theirs and stay.
+This reads a LeRobot dataset of format v2.1 or v3 whose `observation.state` holds the poses of both
+arms, as published by Open-H-Embodiment and SutureBot and written by `render-demos --layout open-h`.
+Its episodes are read like a bag (`rosbag.importer`): resampled to the control rate, split into
+subtasks, freed of pauses and replayed. Only poses and labels are imported, no images.
 
 * Arms: the elements of the state are found by name, `psm1_pose.position.x` … `psm1_jaw`, or
-  `psm1_pos_x`, `psm1_quat_x`; without names a state of sixteen is PSM1's position, quaternion
-  x y z w and jaw, then PSM2's. Elements of other names, as of the ECM, are left out.
-* Frame: the endoscope's view, `ECM_view`, as a dVRK reports `measured_cp`. Where theirs stands
-  otherwise than ours (`envs.absolute.T_WORLD_VIEW`), give its pose in each arm's base as
-  `bag: {frames: {psm1: […], psm2: […]}}`; the jaw is the angle between the fingers.
-* Labels: our column `phase`, of whole numbers, else `instruction.text` frame by frame, else the
+  `psm1_pos_x`, `psm1_quat_x`. Without names, a state of sixteen is PSM1's position, quaternion
+  x y z w and jaw, then PSM2's. Elements with other names, such as the ECM's, are left out.
+* Frame: the endoscope's view, `ECM_view`, in which a dVRK reports `measured_cp`. If their endoscope
+  is placed differently from ours (`envs.absolute.T_WORLD_VIEW`), give its pose in each arm's base
+  as `bag: {frames: {psm1: […], psm2: […]}}`. The jaw is the angle between the fingers.
+* Labels: our column `phase`, of whole numbers, else `instruction.text` of each frame, else the
   task. Our own sentences are known; `bag: {labels: {"needle pickup": grasp}}` says what others
   mean.
 * Needle: our column `needle_pose`; without it the needle is where the task's definition puts it, as
-  in a bag without one.
+  for a bag without a needle.
 
-Nothing in the files runs. Columns that are not named here are never read, so neither are images.
+Nothing in the files is executed. Columns not named here, and therefore images, are never read.
 """
 
 import dataclasses
@@ -53,28 +53,28 @@ from surgicai_vision.envs.absolute import ARM_SIZE, SIZE, T_BASE_VIEW
 from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
 
 DATA = "data/chunk-*/*.parquet"
-"""Data files of both formats: one an episode in v2.1, many episodes a file in v3."""
+"""Data files of both formats: one per episode in v2.1, many episodes per file in v3."""
 VERSIONS = ("v2.1", "v3.0", "v3.1")
 DEMONSTRATOR = "dataset"
-"""Who demonstrates, as it is stored."""
+"""The demonstrator's name, as it is stored."""
 TEXT = "instruction.text"
 VIEW = "ECM_view"
 POSE = "geometry_msgs/PoseStamped"
 JOINT = "sensor_msgs/JointState"
 UNIT_TOLERANCE = 0.01
-"""Furthest a quaternion's length may be from 1."""
+"""Largest deviation of a quaternion's length from 1."""
 JITTER_S = 1e-3
-"""Times this near to the frame rate's are taken as those: they are stored as float32 [s]."""
+"""Times this close to those of the frame rate are replaced by them: they are float32 [s]."""
 MAX_FRAMES = 5_000_000
-"""Frames of a dataset, at most."""
+"""Most frames in a dataset."""
 FPS = (0.1, 10_000.0)
-"""Fewest and most frames a second."""
+"""Fewest and most frames per second."""
 MAX_SECONDS = 1e7
 """Largest time of a frame [s]: four months."""
 LARGEST_WHOLE = 2**53
 """Whole numbers up to this are exact as float64."""
 UNREADABLE = (OSError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException)
-"""What pyarrow raises at a damaged file, and Python at values of another type in it."""
+"""What pyarrow raises for a damaged file, and Python for values of the wrong type in it."""
 ELEMENTS: Sequence[tuple[str, ...]] = (
     (
         *(f"_pose.position.{axis}" for axis in "xyz"),
@@ -83,8 +83,8 @@ ELEMENTS: Sequence[tuple[str, ...]] = (
     ),
     (*(f"_pos_{axis}" for axis in "xyz"), *(f"_quat_{axis}" for axis in "xyzw"), "_jaw"),
 )
-"""Endings of the names of an arm's eight elements, in our order: Open-H-Embodiment's converter, and
-sets made after it for peg transfer."""
+"""Endings of the names of an arm's eight elements, in our order: those of Open-H-Embodiment's
+converter, and of later datasets for peg transfer that follow it."""
 LABELS: Mapping[str, str] = MappingProxyType(
     {names.TASK_TEXTS[name].lower(): name for name in names.SUBTASKS}
 )
@@ -102,15 +102,15 @@ def import_dataset(
     env: Mapping[str, object] | None = None,
     progress: Progress | None = None,
 ) -> list[BagSummary]:
-    """Import a dataset into folders of demonstrations, one a subtask.
+    """Import a dataset into folders of demonstrations, one per subtask.
 
     Args:
         path: the dataset's folder.
-        task: the subtask that is wanted, into `out`; None: every one that is found, into
-            `out`/<task>.
-        out: folder to make; the same import of the same data finds it finished.
-        config: how to read it; topics and convention are a bag's.
-        env: fields of `TaskConfig`, among them the scene with its hole pair and instrument.
+        task: the requested subtask, written to `out`; None: every subtask that is found, written
+            to `out`/<task>.
+        out: folder to create; repeating the same import of the same data reuses it.
+        config: how to read the dataset; topics and convention are those of a bag.
+        env: fields of `TaskConfig`, including the scene with its hole pair and instrument.
         progress: called with (frames read, frames, "frames"), then (demonstrations done,
             demonstrations, "demonstrations").
 
@@ -149,7 +149,7 @@ def import_dataset(
 
 
 def _in_view(config: BagConfig) -> BagConfig:
-    """Return the config with the frame and the labels of a dataset where it gives none."""
+    """Return the config with a dataset's frame and labels where the config gives none."""
     view = {arm: _seven(arm) for arm in names.ARMS}
     frames = dataclasses.replace(
         config.frames,
@@ -169,7 +169,7 @@ class DatasetFiles:
     """The frames of a LeRobot dataset of either format, without their images.
 
     Attributes:
-        frames: number of frames, as its metadata says.
+        frames: number of frames according to its metadata.
 
     Raises:
         BadFile: no such dataset, a damaged one, or one of another format.
@@ -195,7 +195,7 @@ class DatasetFiles:
         self._columns += [key for key in wanted if key in features]
 
     def episodes(self) -> Iterator[tuple[int, Arrays]]:
-        """Yield the number and the arrays of each episode, as `rosbag.reader.read` has them."""
+        """Yield each episode's number and arrays, in the form of `rosbag.reader.read`."""
         tasks = self._tasks()
         waiting: pa.Table | None = None
         total = 0
@@ -220,7 +220,7 @@ class DatasetFiles:
             yield _number(waiting), self._arrays(waiting, tasks)
 
     def _tasks(self) -> dict[int, str]:
-        """Return each task's sentence; none where they cannot be read."""
+        """Return each task's sentence; an empty mapping if there is no file of tasks."""
         v3 = self._path / "meta/tasks.parquet"
         v2 = self._path / "meta/tasks.jsonl"
         try:
@@ -270,7 +270,10 @@ class DatasetFiles:
         return arrays
 
     def _times(self, table: pa.Table, where: str) -> NDArray[np.int64]:
-        """Return each frame's time [ns], the frame rate's where they are as even as float32."""
+        """Return each frame's time [ns].
+
+        It comes from the frame rate if the stored times agree with that within `JITTER_S`.
+        """
         even = _whole(table, "frame_index", where) / self._fps
         stored = _numbers(table, "timestamp", where)
         if max(np.abs(even).max(), np.abs(stored).max()) > MAX_SECONDS:
@@ -286,7 +289,7 @@ def _number(table: pa.Table) -> int:
 
 
 def _joined(first: pa.Table, second: pa.Table, where: str) -> pa.Table:
-    """Return the frames of both; those of one episode may stand in two files."""
+    """Return the frames of both; one episode's frames may be in two files."""
     try:
         return pa.concat_tables([first, second])
     except pa.ArrowException as error:
@@ -296,7 +299,7 @@ def _joined(first: pa.Table, second: pa.Table, where: str) -> pa.Table:
 
 
 def _numbers(table: pa.Table, key: str, where: str) -> NDArray[np.float64]:
-    """Return a column of a number a frame as (N,), all of them finite.
+    """Return a column with one number per frame as (N,), all of them finite.
 
     Raises:
         BadFile: there is no such column, or it holds anything else.
@@ -317,7 +320,7 @@ def _numbers(table: pa.Table, key: str, where: str) -> NDArray[np.float64]:
 
 
 def _whole(table: pa.Table, key: str, where: str) -> NDArray[np.int64]:
-    """Return a column of a whole number a frame as (N,); `BadFile` as `_numbers`."""
+    """Return a column with one whole number per frame as (N,); raise `BadFile` as `_numbers`."""
     values = _numbers(table, key, where)
     if (np.abs(values) > LARGEST_WHOLE).any() or (values != np.floor(values)).any():
         raise BadFile(f"{where}: {key} must hold whole numbers of up to 15 digits.")
@@ -325,7 +328,7 @@ def _whole(table: pa.Table, key: str, where: str) -> NDArray[np.int64]:
 
 
 def _elements(path: Path, features: Mapping[str, JSON]) -> dict[str, list[int]]:
-    """Return where each arm's eight values stand in the state."""
+    """Return the indices of each arm's eight values in the state."""
     row = features.get(names.STATE)
     given = row.get("names") if isinstance(row, dict) else None
     while isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
@@ -368,9 +371,9 @@ def _pose(values: NDArray[np.float64], where: str, what: str) -> NDArray[np.floa
 
 
 def _labels(table: pa.Table, tasks: Mapping[int, str], where: str) -> NDArray[np.str_] | None:
-    """Return what each frame shows: its phase, its instruction or its task; None of nothing.
+    """Return what each frame shows: its phase, its instruction or its task; None without any.
 
-    A column `phase` of another type than ours is somebody else's and says nothing to us.
+    A column `phase` of a type other than ours is not from us and is ignored.
     """
     there = table.column_names
     if names.PHASE in there and pa.types.is_integer(table.schema.field(names.PHASE).type):

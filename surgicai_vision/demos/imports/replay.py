@@ -2,23 +2,23 @@
 
     demo, clipped = Replay(config).demo(episode)
 
-A recording of SurgicAI holds the commanded tip pose of one arm and nothing of the needle. In every
-state the arm is at the recorded pose, the other one at its start or, in handoff, holding the
-needle, and the needle is where the task's definition puts it:
+A recording of SurgicAI holds the commanded tip pose of one arm and nothing about the needle. In
+every state that arm is at the recorded pose, the other one is at its start or, in handoff, holds
+the needle, and the needle is where the task's definition puts it:
 
 * handoff: still; its 105° point is where the goal grasps it.
 * grasp: still; its 17.5° point is where the goal grasps it. (The angle was drawn from 5°–20° and
   not recorded; the shipped set has the needle's tip on the entry, which gives 15°–20°.)
-* place, insert: rigid in the jaws as it is when they are at the goal, that is with the tip on the
-  entry and perpendicular to it, or with the 100° point 2 mm beyond the exit.
-* pullout: rigid in PSM1's jaws, grasped as the handoff's goal grasps it.
+* place, insert: fixed in the jaws as it must be when they are at the goal: with the tip on the
+  entry and perpendicular to it (place), or with the 100° point 2 mm beyond the exit (insert).
+* pullout: fixed in PSM1's jaws, grasped as by the handoff's goal.
 
-Sources: needle points, insertion depth and lift from SurgicAI's released code (the project's
-facts); the relations between needle and goal were fitted to needle poses that were derived
-independently for handoff, place and insert, and the tests compare with those.
+Sources: needle points, insertion depth and lift are from SurgicAI's released code (the project's
+facts). The relations between needle and goal were fitted to needle poses that were derived
+independently for handoff, place and insert; the tests compare against those.
 
-The first transition of a pullout episode is dropped: a jump from the start pose, a fault of the
-recorder.
+The first transition of a pullout episode is dropped: it is a jump from the start pose, a fault of
+the recorder.
 """
 
 import itertools
@@ -43,14 +43,14 @@ from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.rotations import matrix_to_rotvec, rpy_to_matrix
 
 LIFT = 0.005
-"""Height of the tip frame over the needle's plane at the released code's grasp goals [m]."""
+"""Height of the tip frame above the needle's plane at the released code's grasp goals [m]."""
 GRASP_ANGLE, HANDOFF_ANGLE, INSERT_ANGLE = (
     float(angle) for angle in np.radians([17.5, 105.0, 100.0])
 )
 INSERT_DEPTH = 0.002
 """Distance of the needle's 100° point beyond the exit at the goal of insert [m]."""
 MOST_CLIPPED = 0.01
-"""Largest share of a recording's steps that may exceed a step preset for it to serve."""
+"""Largest share of a recording's steps that may exceed a step preset for the preset to be used."""
 HOLD_ANGLES = np.radians([15.0, 20.0, 25.0, 30.0, 10.0, 35.0, 40.0, 5.0])
 """Points of the needle at which PSM2 may hold it during the handoff, tried in this order: SurgicAI
 draws its grasps from 10°–50° after the approach's 5°–20°."""
@@ -66,7 +66,7 @@ class Episode:
 
     Attributes:
         pose: commanded tip pose and jaw, x y z [m] roll pitch yaw jaw [rad], (T + 1, 7).
-        goal: the same of the goal, (7,).
+        goal: the same for the goal, (7,).
         action: as recorded, (T, 7).
         reward: as recorded, (T,).
         success: after the step, as recorded, (T,) bool.
@@ -89,7 +89,7 @@ Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def trimmed(episode: Episode, task: str) -> Episode:
-    """Return the episode without the jump that opens every pullout recording."""
+    """Return the episode without the jump at the start of every pullout recording."""
     if task != "pullout":
         return episode
     return Episode(
@@ -98,7 +98,7 @@ def trimmed(episode: Episode, task: str) -> Episode:
 
 
 def pose_matrix(seven: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return T_base_tip (4, 4) of x y z [m] roll pitch yaw [rad] (the jaw is ignored)."""
+    """Return T_base_tip (4, 4) from x y z [m] roll pitch yaw [rad] (the jaw is ignored)."""
     pose = np.eye(4)
     pose[:3, :3] = rpy_to_matrix(*seven[3:6])
     pose[:3, 3] = seven[:3]
@@ -120,7 +120,7 @@ def needle_path(episode: Episode, task: str) -> NDArray[np.float64]:
 def _grasp(task: str) -> NDArray[np.float64]:
     """Return T_needle_tip (4, 4) at the goal of grasp or handoff.
 
-    The jaws come down the normal of the needle's plane; PSM1 closes along -radial, PSM2 along
+    The jaws come down along the normal of the needle's plane; PSM1 closes along -radial, PSM2 along
     +radial.
     """
     is_grasp = task == "grasp"
@@ -155,7 +155,7 @@ def _needle_at_goal(task: str) -> NDArray[np.float64]:
 
 
 def grip_error(episode: Episode, task: str) -> float:
-    """Return how far the needle would be outside the jaws that should hold it [m], at least 0."""
+    """Return how far outside the jaws that should hold it the needle would be [m], at least 0."""
     if task not in ("place", "insert"):
         return 0.0
     base = kinematics.base_in_world(names.ACTIVE_ARM[task])
@@ -169,7 +169,7 @@ def motion_actions(motion: Motion, step: str) -> tuple[NDArray[np.float32], int]
     """Return a motion as actions of our envs, (T, 7) float32, and how many had to be clipped.
 
     Args:
-        motion: of one arm.
+        motion: one arm's motion.
         step: a key of `STEPS`.
     """
     tip, jaw = motion
@@ -187,11 +187,11 @@ def motion_actions(motion: Motion, step: str) -> tuple[NDArray[np.float32], int]
 
 
 def fitting_step(motions: Sequence[Motion], smallest: str = next(iter(STEPS))) -> str:
-    """Return the smallest step preset that nearly all steps fit into, or the best one.
+    """Return the smallest step preset that nearly all steps fit into, or else the best one.
 
     Args:
-        motions: of one arm in several episodes.
-        smallest: the preset from which on they are tried.
+        motions: one arm's motions in several episodes.
+        smallest: the smallest preset that is tried.
     """
     steps = sum(len(jaw) - 1 for _, jaw in motions)
     sizes = list(STEPS)[list(STEPS).index(smallest) :]
@@ -209,9 +209,9 @@ class Track:
     Attributes:
         arms: arm → its motion; other arms are at their start.
         needle: T_world_needle (T + 1, 4, 4).
-        grasp_angle: the needle's point that is grasped [rad], where the task has one.
-        passed: `TaskState.holes_passed` in each state, (T + 1,), or None for that of the task's
-            start.
+        grasp_angle: the needle's grasped point [rad], where the task has one.
+        passed: `TaskState.holes_passed` in each state, (T + 1,), or None for its value at the
+            task's start.
     """
 
     arms: Mapping[str, Motion]
@@ -280,7 +280,7 @@ class Replay:
         return np.stack(states), infos
 
     def reward(self, success: bool, info: Mapping[str, Any]) -> float:
-        """Return the env's reward of a state, given whether it counts as a success."""
+        """Return the env's reward for a state, given whether it counts as a success."""
         return self._env.reward({**info, "is_success": success})
 
     def as_demo(

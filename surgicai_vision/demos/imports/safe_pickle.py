@@ -2,14 +2,14 @@
 
     tree = unpickle(content, "demos.pkl")     # dict, list, tuple, str, bytes, numbers, numpy arrays
 
-A pickle is a program. Here it is read twice: first its instructions are listed without running any,
-and a global outside `ADMITTED`, an instruction that could make other objects, or a memo made to eat
-memory is refused by name; then it is run by an unpickler whose globals are not numpy's functions
-but the small stand-ins below, which check every argument and build arrays from bytes themselves.
-Numpy's own state setters never see untrusted data, and object arrays (arrays of further pickled
-objects) are refused.
+A pickle is a program. Here it is read twice. First its instructions are listed without running any:
+a global outside `ADMITTED`, an instruction that could create other objects, or a memo built to
+exhaust memory is refused by name. Then it is run by an unpickler whose globals are not numpy's
+functions but the small stand-ins below, which check every argument and build arrays from bytes
+themselves. Numpy's own state setters never see untrusted data, and object arrays (arrays of further
+pickled objects) are refused.
 
-Every refusal is a `BadFile` of one line.
+Every refusal is a `BadFile` with a one-line message.
 """
 
 import io
@@ -93,8 +93,8 @@ _OPCODES = frozenset(
         "BUILD",
     )
 )
-"""Instructions a pickle of arrays and containers needs; those that make instances, extensions or
-persistent objects are not among them."""
+"""Instructions needed by a pickle of arrays and containers; those that create instances, extensions
+or persistent objects are not included."""
 
 
 class _Ndarray:
@@ -104,7 +104,7 @@ class _Ndarray:
 
 
 class _Array:
-    """An array in the making: `__setstate__` is what a pickle calls to fill it."""
+    """An unfinished array, which a pickle fills by calling `__setstate__`."""
 
     __slots__ = ("value",)
 
@@ -129,7 +129,7 @@ class _Array:
 
 
 class _Dtype:
-    """A dtype in the making: the code from its call, the byte order from its state."""
+    """An unfinished dtype: its code comes from the call, its byte order from the state."""
 
     __slots__ = ("code", "order")
 
@@ -201,7 +201,7 @@ ADMITTED = MappingProxyType(
         ("numpy", "dtype"): _MakeDtype(),
     }
 )
-"""Global → what stands for it. Everything else is refused."""
+"""Global → its stand-in. Everything else is refused."""
 
 
 class _Unpickler(pickle.Unpickler):
@@ -262,7 +262,7 @@ def _inspect(content: bytes) -> None:
             if (module, attribute) not in ADMITTED:
                 _refuse_global(module, attribute)
         elif name == "STACK_GLOBAL" and len(strings) == 2:
-            # The names may also come from the memo; then `find_class` has the last word.
+            # The names may also come from the memo; then `find_class` decides.
             known = {part for pair in ADMITTED for part in pair}
             if not known.issuperset(strings):
                 _refuse_global(*strings)
@@ -271,7 +271,7 @@ def _inspect(content: bytes) -> None:
 
 
 def _plain(value: object, seen: dict[int, object], depth: int) -> object:
-    """Return `value` with finished arrays in the place of those in the making."""
+    """Return `value` with finished arrays instead of unfinished ones."""
     if isinstance(value, _Array):
         if value.value is None:
             _refuse("an array has no content")

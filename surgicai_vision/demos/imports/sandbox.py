@@ -1,13 +1,13 @@
-"""Sandbox: reads untrusted recordings in a process of its own, with limits, without a network.
+"""Sandbox: reads untrusted recordings in a separate process with limits and without a network.
 
     arrays = read_sandboxed(Path("regrasp_all_episodes_merged.pkl"))
     arrays = read_sandboxed(Path("trial.bag"), "bag", topics={"psm2_pose": "/PSM2/measured_cp"})
 
-The child begins with an empty network namespace of its own, where the kernel allows it, and sets
-its limits before it opens the file: memory, processor time, size of what it writes. An audit hook
-that cannot be removed then ends every attempt to start a process, to open a socket, or to write any
-file (its one result is open by then). It returns plain arrays (npz without pickles). Whatever fails
-in it is a `BadFile`, or the `InputError` of its reader.
+The child first enters an empty network namespace, where the kernel allows it. Before it opens the
+file, it limits its memory, its processor time and the size of what it writes. From then on, an
+audit hook that cannot be removed ends the child at any attempt to start a process, open a socket or
+write a file (its only output file is already open). It returns plain arrays (npz without pickles).
+Any failure in it is raised as a `BadFile`, or as the `InputError` of its reader.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ MEMORY = 2 * 2**30
 PROCESSOR_SECONDS = 60
 WALL_SECONDS = 120
 MAX_WRITTEN = 2**30
-"""Limit of the child's one file [byte]."""
+"""Size limit of the child's only output file [byte]."""
 
 REFUSED = (
     "socket.",
@@ -76,11 +76,11 @@ def read_sandboxed(
 
     Args:
         path: the file, or a bag's folder.
-        kind: a key of `READERS`; see its `read` for what comes back.
-        options: further arguments of its `read`.
+        kind: a key of `READERS`; see that module's `read` for what is returned.
+        options: further arguments of that `read`.
 
     Raises:
-        BadFile: what the reader refuses, and what exceeds the limits.
+        BadFile: a file that the reader refuses, or one that exceeds the limits.
         InputError: arguments that do not match the recording.
     """
     if not path.is_file() and not (path.is_dir() and kind == "bag"):
@@ -117,15 +117,15 @@ def read_sandboxed(
 
 
 def _search_path() -> str:
-    """Return a PYTHONPATH by which the child finds the same package."""
+    """Return a PYTHONPATH with which the child finds the same package."""
     return str(Path(__file__).parents[3])
 
 
 def _leave_network() -> None:
-    """Take this process into an empty network namespace.
+    """Move this process into an empty network namespace.
 
-    Users other than root need a user namespace for it, which only a process of one thread may make:
-    this comes before everything that starts another.
+    Users other than root need a user namespace for this, which only a single-threaded process may
+    create, so this runs before anything that starts another thread.
     """
     for namespaces in (os.CLONE_NEWNET, os.CLONE_NEWUSER | os.CLONE_NEWNET):
         with contextlib.suppress(OSError):  # not every kernel and container lets us
@@ -134,7 +134,7 @@ def _leave_network() -> None:
 
 
 def _limit() -> None:
-    """Take from this process the rights that reading a file does not need."""
+    """Drop the rights of this process that reading a file does not need."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_SECONDS, PROCESSOR_SECONDS))
     resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_WRITTEN, MAX_WRITTEN))
@@ -150,7 +150,7 @@ def _limit() -> None:
 
 
 def main(path: str, result: str, kind: str, options: str) -> int:
-    """Read `path`, write its arrays to `result`; the child's whole program."""
+    """Read `path` and write its arrays to `result`; this is the child's whole program."""
     read = importlib.import_module(READERS[kind]).read
     with open(result, "wb") as file:
         _limit()

@@ -3,12 +3,15 @@
     summary = import_demos(Path("pickup.pkl"), task="handoff", out=Path("demos"))
 
 A recording is read (`sandbox`), split into episodes, checked against the task, replayed (`replay`)
-and written. Half of the released insertions, and a few placements, turn the long way round, because
-the released code compares yaw angles without unwrapping them; our arm's roll joint cannot follow,
-so their yaw is unwrapped: the same path, with the yaw going the short way at the same times. The
-recorded rotation increments are roll, pitch and yaw; ours are rotation vectors in the base's axes,
-so actions are recomputed from the poses and the recorded ones only determine the step preset. Where
-more than one in a hundred would not fit into it, the next larger preset is taken.
+and written.
+
+Half of the released insertions, and a few placements, turn the long way round, because the released
+code compares yaw angles without unwrapping them. Our arm's roll joint cannot follow, so their yaw
+is unwrapped: the path is the same, but the yaw goes the short way at the same times.
+
+The recorded rotation increments are roll, pitch and yaw; ours are rotation vectors in the base's
+axes. Actions are therefore recomputed from the poses, and the recorded ones only determine the step
+preset. If more than one in a hundred would not fit the preset, the next larger one is used.
 """
 
 import dataclasses
@@ -31,17 +34,18 @@ from surgicai_vision.demos.record import finished
 from surgicai_vision.demos.store import MARKER, list_demos, read_marker, write_demo, write_marker
 
 OPEN_JAW = 0.4
-"""A jaw wider than this after the first step belongs to a grasp; the recordings have 0.8 or 0
+"""A jaw open wider than this after the first step means a grasp; the recordings have 0.8 or 0
 [rad]."""
 AGREEMENT = 0.02
-"""A step agrees with a preset when it differs from action × step size by less, in step sizes."""
+"""A step agrees with a preset if it differs from action × step size by less than this, in step
+sizes."""
 STEP_LIMIT = 200
 """Episode limit of the image evaluation (facts of SurgicAI); longer recordings raise it."""
 
 
 @dataclass(frozen=True)
 class ImportSummary:
-    """What an import made.
+    """The result of an import.
 
     Attributes:
         paths: the demonstrations' files.
@@ -69,8 +73,8 @@ def import_demos(
 
     Args:
         file: a pickle as SurgicAI writes it, or an npz of the same arrays.
-        task: what it shows, one of `names.SUBTASKS`; the file does not say it.
-        out: folder to make; the same import of the same file finds it finished.
+        task: what the recording shows, one of `names.SUBTASKS`; the file does not say.
+        out: folder to create; repeating the same import of the same file reuses it.
         progress: called with (episodes done, episodes, "episodes").
 
     Raises:
@@ -135,7 +139,7 @@ def _write(
 
 
 def split(arrays: Mapping[str, NDArray[np.float64]]) -> list[Episode]:
-    """Split transitions into episodes at `done`, with metres in place of centimetres.
+    """Split transitions into episodes at `done`, and convert centimetres to metres.
 
     Raises:
         BadFile: the last episode is not done, or a transition does not continue the one before.
@@ -175,10 +179,10 @@ def split(arrays: Mapping[str, NDArray[np.float64]]) -> list[Episode]:
 def check_task(episodes: list[Episode], task: str) -> None:
     """Refuse a task that the motion contradicts.
 
-    The contradictions are another arm, open jaws on a held needle, and a needle beside the jaws.
+    The contradictions are another arm, open jaws on a held needle, and a needle outside the jaws.
 
     Raises:
-        InputError: the contradiction, and the tasks that would fit.
+        InputError: it names the contradiction and the tasks that would fit.
     """
     # PSM1 works at positive x of its base and PSM2 at negative x, in every recording.
     arm = (
@@ -205,7 +209,7 @@ def check_task(episodes: list[Episode], task: str) -> None:
 
 
 def is_yaw_wrapped(episode: Episode) -> bool:
-    """Return True if an episode turns further than half a turn in yaw."""
+    """Return True if an episode turns by more than half a turn in yaw."""
     return bool(abs(episode.pose[-1, 5] - episode.pose[0, 5]) > np.pi)
 
 
@@ -221,10 +225,10 @@ def unwrap_yaw(episode: Episode) -> Episode:
 
 
 def infer_step(episodes: list[Episode]) -> tuple[str, int]:
-    """Return the step preset that explains the motion best, and how many steps it does not.
+    """Return the step preset that best explains the motion, and how many steps it does not explain.
 
-    The first release's insertions have a step of 0.25 mm, which is no preset of ours: a motion that
-    any other constant step explains gets the smallest preset that is as large.
+    The first release's insertions have a step of 0.25 mm, which is not one of our presets. A motion
+    explained by any other constant step gets the smallest preset that is at least as large.
 
     Raises:
         InputError: no constant step explains the motion.
@@ -260,7 +264,7 @@ def _unexplained(
 
 
 def _fitted(moves: NDArray[np.float64], actions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a motion's step size (7,), the median of move over action, also for rotation."""
+    """Return a motion's step size (7,), the median of move over action, for rotation as well."""
     size = np.full(7, STEPS["paper"][2])
     for axes in (slice(0, 3), slice(3, 6)):
         moved = np.abs(actions[:, axes]) > AGREEMENT

@@ -1,15 +1,15 @@
-"""SurgicAI's recordings as arrays: what its pickles hold, before it is checked for sense.
+"""SurgicAI's recordings as arrays: the contents of its pickles, before any plausibility check.
 
-The layout (read from the released files; the observation's from the released code): a list of
-transitions, each {"obs": {"observation": (21,), …}, "next_obs": likewise, "action": (7,), "reward":
-(1,), "done": (1,), "info": {"is_success": …}}. The 21 values are the active arm's commanded pose,
-its goal and their difference, each x y z [cm] roll pitch yaw jaw [rad] in the arm's own base;
-fixed-axis angles, R = Rz(yaw) Ry(pitch) Rx(roll). The same transitions as plain arrays (.npz) are
-read too.
+The layout (taken from the released files; that of the observation from the released code) is a list
+of transitions, each {"obs": {"observation": (21,), …}, "next_obs": likewise, "action": (7,),
+"reward": (1,), "done": (1,), "info": {"is_success": …}}. The 21 values are the active arm's
+commanded pose, its goal and their difference, each x y z [cm] roll pitch yaw jaw [rad] in the arm's
+own base, with fixed-axis angles, R = Rz(yaw) Ry(pitch) Rx(roll). The same transitions as plain
+arrays (.npz) are read too.
 
 `read(path)` returns {"observation": (N, 21), "next_observation": (N, 21), "action": (N, 7),
 "reward": (N,), "done": (N,), "success": (N,)}, float64, or raises `BadFile`. It imports nothing but
-numpy and runs in the process of `sandbox`.
+numpy and runs in the child process of `sandbox`.
 """
 
 import zipfile
@@ -30,13 +30,13 @@ FIELDS = {
     "done": 1,
     "success": 1,
 }
-"""Array → numbers in a row."""
+"""Array → numbers per row."""
 
 MAX_TRANSITIONS = 1_000_000
 
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Read a recording, a pickle or an npz by its first bytes.
+    """Read a recording; its first bytes tell whether it is a pickle or an npz.
 
     Raises:
         BadFile: missing, empty, damaged, malicious, or of another layout.
@@ -105,12 +105,12 @@ def _transitions(tree: object, path: Path) -> dict[str, list[NDArray[np.float64]
 
 
 def _observation(value: object) -> object:
-    """Return the 21 values of an observation, bare or in SurgicAI's dictionary."""
+    """Return the 21 values of an observation, given bare or in SurgicAI's dictionary."""
     return value["observation"] if isinstance(value, Mapping) else value
 
 
 def _npz(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Return the rows of an npz; its arrays may not unpack to more than a recording can have."""
+    """Return the rows of an npz; its arrays may not unpack to more than a recording can hold."""
     names = {name: "is_success" if name == "success" else name for name in FIELDS}
     try:
         with zipfile.ZipFile(path) as archive:

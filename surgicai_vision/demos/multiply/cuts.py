@@ -3,10 +3,11 @@
     source = read_source("demos/episode_000000.safetensors")
     source.segments["insert"]           # its pieces, in order; see `segments`
 
-`CUTS` says what cuts a subtask's part. Pauses are left out where the tool moves freely. A
-demonstrator that does not know the goal of a grasp (`demonstrator.GOAL_FREE_DEMONSTRATORS`) makes
-attempts at given times: all of them are kept, relative to the needle itself, with the times. Of
-another one's attempts the last is kept.
+`CUTS` names the function that cuts each subtask's part. Pauses are left out where the tool moves
+freely. A demonstrator that does not know the goal of a grasp
+(`demonstrator.GOAL_FREE_DEMONSTRATORS`) makes attempts at given times: all of them are kept,
+relative to the needle itself, with their times. Of any other demonstrator's attempts, only the last
+is kept.
 """
 
 import dataclasses
@@ -60,19 +61,19 @@ Array = NDArray[np.float64]
 NAME = "multiply"
 """The demonstrator's name, as it is stored."""
 NEAR = 0.015
-"""Where a way's end begins that is copied: so far from where it goes [m]. More than the expert's
-`HOVER`, less than the way to anything else."""
+"""Distance from a motion's goal at which the end that is copied begins [m]. It is more than the
+expert's `HOVER` and less than the distance to anything else."""
 NEAR_ENTRY = 0.004
 """The same before the entry, from a start that is at most 5.5 mm off [m]."""
 LIFTED = 0.004
-"""Height over its place from which a needle may travel [m] (the expert's `CLEAR`)."""
+"""Height above its resting place from which a needle may travel [m] (the expert's `CLEAR`)."""
 CLOSED = 0.1
-"""A jaw commanded below this is closed [rad]: `control.SQUEEZE_BELOW`."""
+"""A jaw commanded below this angle is closed [rad]: `control.SQUEEZE_BELOW`."""
 OTHER_JAWS = 0.002
-"""A grasp that ends further from the goal was made by other jaws than ours [m]; the tolerances of
-grasp and handoff are 1 mm and 2 mm."""
+"""A grasp that ends further than this from the goal was made by jaws other than ours [m]; the
+tolerances of grasp and handoff are 1 mm and 2 mm."""
 JAW_STEP = 0.05
-"""How far a jaw closes a step [rad], in every preset of `config.STEPS`."""
+"""How far a jaw closes per step [rad], in every preset of `config.STEPS`."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +82,10 @@ class Track:
 
     Attributes:
         moment: where the objects were in the first state.
-        command: T_world_tip that the active tool was told, (n + 1, 4, 4).
+        command: commanded T_world_tip of the active tool, (n + 1, 4, 4).
         jaw: its commanded jaw angle, (n + 1,) [rad].
-        tip: T_world_tip of it, measured, (n + 1, 4, 4).
-        needle: T_world_needle, measured, (n + 1, 4, 4).
+        tip: its measured T_world_tip, (n + 1, 4, 4).
+        needle: measured T_world_needle, (n + 1, 4, 4).
         step: control step of each state in its episode, (n + 1,).
     """
 
@@ -97,7 +98,7 @@ class Track:
 
     @functools.cached_property
     def carried(self) -> Array:
-        """Where the held needle would be if the tool were where it is told to be, (n + 1, 4, 4)."""
+        """Where the held needle would be if the tool were at its commanded pose, (n + 1, 4, 4)."""
         carried: Array = self.command @ np.linalg.inv(self.tip) @ self.needle
         return carried
 
@@ -117,7 +118,7 @@ def read_source(path: str) -> Source:
     """Read a demonstration and cut it; once per process.
 
     Raises:
-        BadFile: the file is no demonstration.
+        BadFile: the file is not a demonstration.
         InputError: it was multiplied itself, or was recorded in a scene that is compiled
             differently now.
     """
@@ -148,7 +149,7 @@ def read_source(path: str) -> Source:
 
 
 def _runs(demo: Demo) -> list[tuple[str, int, int]]:
-    """Return (subtask, first state, last state) of each subtask's last run of frames."""
+    """Return (subtask, first state, last state) of each run of control steps in one subtask."""
     return [
         (names.SUBTASKS[demo.phase[first]], first, last)
         for first, last in runs_of(demo.phase)
@@ -186,7 +187,7 @@ def _track(
 
 
 def _cut_grasp(track: Track, keeps_time: bool) -> tuple[Segment, ...]:
-    """Cut the way in to a grasp: the last attempt, or all of them with their times."""
+    """Cut the approach to a grasp: the last attempt, or all of them with their times."""
     closed = track.jaw < CLOSED
     opens = [_before_rise(track.jaw, at) for at in np.flatnonzero(closed[:-1] & ~closed[1:])]
     bounds = [0, *opens, len(closed) - 1]
@@ -199,16 +200,16 @@ def _cut_grasp(track: Track, keeps_time: bool) -> tuple[Segment, ...]:
 
 
 def _before_rise(jaw: Array, index: int) -> int:
-    """Return the last index up to `index` from which a jaw (n,) [rad] only opens."""
+    """Return the first index from which a jaw (n,) [rad] only opens up to `index`."""
     while index and jaw[index - 1] < jaw[index]:
         index -= 1
     return index
 
 
 def _with_our_jaws(grasp: FreeSegment) -> FreeSegment:
-    """Return a way in to a grasp that ends where our jaws hold the needle, closed.
+    """Return an approach to a grasp that ends where our jaws hold the needle, closed.
 
-    SurgicAI's tip frame is `replay.LIFT` over the needle's plane at the goal, ours twice that.
+    SurgicAI's tip frame is `replay.LIFT` above the needle's plane at the goal, ours twice that.
     """
     miss = grasp.path[-1, :3, 3]
     path = grasp.path.copy()
@@ -225,7 +226,7 @@ def _with_our_jaws(grasp: FreeSegment) -> FreeSegment:
 
 
 def _cut_place(track: Track, _: bool) -> tuple[Segment, ...]:
-    """Cut the lift of the needle and the end of its way to the entry."""
+    """Cut the lift of the needle and the end of its path to the entry."""
     end = len(track.jaw) - 1
     height = track.carried[:, 2, 3] - track.carried[0, 2, 3]
     lifted = int(np.argmax(height > LIFTED)) if (height > LIFTED).any() else 0
@@ -236,7 +237,7 @@ def _cut_place(track: Track, _: bool) -> tuple[Segment, ...]:
 
 
 def _cut_insert(track: Track, _: bool) -> tuple[Segment, ...]:
-    """Cut the way in to the entry and the way through the tissue."""
+    """Cut the path into the entry and the path through the tissue."""
     end = len(track.jaw) - 1
     entry = track.moment.stitch.pair.entry
     tips = track.needle @ tip_of_needle(track.moment)
@@ -251,7 +252,7 @@ def _cut_insert(track: Track, _: bool) -> tuple[Segment, ...]:
 
 
 def _cut_pullout(track: Track, _: bool) -> tuple[Segment, ...]:
-    """Cut the way out of the tissue and the end of the way to the end point."""
+    """Cut the path out of the tissue and the end of the path to the end point."""
     end = len(track.jaw) - 1
     stitch = track.moment.stitch
     line = np.column_stack([needle.polyline(13, stitch.radius, stitch.tip_angle), np.ones(13)])
@@ -273,11 +274,11 @@ CUTS: Mapping[str, Callable[[Track, bool], tuple[Segment, ...]]] = MappingProxyT
         "pullout": _cut_pullout,
     }
 )
-"""Subtask → what cuts its part of a demonstration."""
+"""Subtask → the function that cuts its part of a demonstration."""
 
 
 def _last_beyond(path: Array, goal: Array, first: int, last: int, near: float = NEAR) -> int:
-    """Return the index after the last one, of `first` to `last`, that is not `near` a goal [m]."""
+    """Return the index after the last one in [first, last] further than `near` [m] from a goal."""
     away = np.linalg.norm(path[first : last + 1, :3, 3] - goal[:3, 3], axis=1) > near
     beyond = np.flatnonzero(away)
     return min(first + int(beyond[-1]) + 1, last) if len(beyond) else first
@@ -296,7 +297,7 @@ def _free(
 
 
 def _moves(track: Track, kept: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which states' commands differ from the one before, the first always, (n,)."""
+    """Return which states' commands differ from the one before (the first always does), (n,)."""
     before = np.maximum(kept - 1, kept[0])
     change = np.abs(track.command[kept] - track.command[before]).max(axis=(1, 2))
     moves: NDArray[np.bool_] = change > STILL

@@ -4,12 +4,13 @@
     env.reset(seed=7)
     env.step(multiplier.action())
 
-An episode takes one demonstration, at random or the one whose start was most alike, and executes
-its pieces (`segments`) one after the other: the tool, or the needle in it, goes straight from where
-it is to a piece's first pose and then along the piece, where its object is now. Every step is one
-action of the env, at most one step size long. The path waits for the tool: its parameter goes on by
-one sample a step, or by less where an action is too small to follow, so that what noise pushes away
-comes back to the path. In the whole procedure each subtask begins when the env says so.
+An episode takes one demonstration, at random or the one with the most similar start, and executes
+its pieces (`segments`) one after another. The tool, or the needle in it, goes straight from where
+it is to a piece's first pose and then along the piece, re-posed to where its object is now. Every
+step is one action of the env, at most one step size long. The path waits for the tool: its
+parameter advances by one sample per step, or by less where an action is too small to follow, so
+that a tool pushed away by noise comes back to the path. In the whole procedure, each subtask begins
+when the env says so.
 
 The method is MimicGen's (Mandlekar et al., CoRL 2023); `segments` says what differs.
 """
@@ -50,7 +51,7 @@ class Multiplier(Demonstrator):
         source: one of `SOURCES`.
 
     Raises:
-        BadFile: a file that is no demonstration.
+        BadFile: a file that is not a demonstration.
         InputError: no file, one of another task, one that was multiplied, or a task that has no
             pieces.
     """
@@ -76,7 +77,7 @@ class Multiplier(Demonstrator):
 
     @property
     def persists(self) -> bool:
-        """Return True where the demonstration goes on after its success."""
+        """Return True if the demonstration continues after its success."""
         return self._chosen().keeps_time
 
     @property
@@ -103,7 +104,7 @@ class Multiplier(Demonstrator):
         return moment_of(env, env.subtask.arm, env.subtask.name, source.keeps_time)
 
     def _chosen(self) -> Source:
-        """Return the episode's demonstration, chosen when it is first asked for."""
+        """Return the episode's demonstration, chosen when it is first requested."""
         if self._source is None:
             if self._choice == RANDOM:
                 rng = self.env.np_random.spawn(1)[0]
@@ -116,7 +117,7 @@ class Multiplier(Demonstrator):
 
 
 class _Walk:
-    """The walk along one re-posed piece, with the straight way to it before."""
+    """The walk along one re-posed piece, preceded by the straight path to it."""
 
     def __init__(self, segment: Segment, world: WorldState, moment: Moment, keeps_time: bool):
         self._segment = segment
@@ -135,11 +136,11 @@ class _Walk:
 
     @property
     def done(self) -> bool:
-        """Return True if the last pose was the target."""
+        """Return True once the last pose was the target."""
         return self._at >= len(self._path) - 1
 
     def next(self, world: WorldState) -> ToolTarget:
-        """Go on as far as one action can follow and return where the tool should be."""
+        """Advance as far as one action can follow and return where the tool should be."""
         if self._keeps_time and self._is_still():
             self._wait(world.task_state.steps)
         else:
@@ -154,14 +155,14 @@ class _Walk:
         return ToolTarget(self._tool(world, self._pose(self._at)), self._jaw_at(self._at))
 
     def _hurried(self, world: WorldState) -> float:
-        """Return the furthest sample that the same action reaches: a slow hand is made faster."""
+        """Return the furthest sample that one action reaches, which speeds up slow motions."""
         at = self._at
         while at + 1.0 <= len(self._path) - 1.0 and self._way(world, at + 1.0) <= 1.0:
             at += 1.0
         return at
 
     def _wait(self, step: int) -> None:
-        """Make a pause longer or shorter, so that what follows has the demonstrated time."""
+        """Lengthen or shorten a pause so that what follows happens at the demonstrated time."""
         index = int(self._at)
         while index + 1 < len(self._path) and self._is_pause(index) and self._step[index] <= step:
             index += 1
@@ -188,7 +189,7 @@ class _Walk:
         return max(float(move), abs(self._jaw_at(at) - world.command_jaw) / world.step.jaw)
 
     def _tool(self, world: WorldState, body: Array) -> Array:
-        """Return T_world_tip that brings what moves to T_world_body."""
+        """Return the T_world_tip that brings the moving body to T_world_body."""
         if self._frame is None:
             return body
         return world.tip_for_needle(body @ np.linalg.inv(self._frame))
@@ -210,7 +211,7 @@ class _Walk:
 
 
 def _between(first: Array, last: Array, share: float) -> Array:
-    """Return the pose (4, 4) a share of the straight way from one to another."""
+    """Return the pose (4, 4) at a share of the straight path from one pose to another."""
     pose = np.eye(4)
     turn = matrix_to_rotvec(last[:3, :3] @ first[:3, :3].T)
     pose[:3, :3] = rotvec_to_matrix(share * turn) @ first[:3, :3]
@@ -219,9 +220,9 @@ def _between(first: Array, last: Array, share: float) -> Array:
 
 
 def _away(one: Moment, other: Moment, step: StepSize) -> float:
-    """Return how much two starts differ as the tool sees them, in step sizes.
+    """Return how much two starts differ from the tool's viewpoint, in step sizes.
 
-    What counts is where the needle's grasp and the entry lie in the tool's frame.
+    The comparison is between the poses of the needle's grasp and of the entry in the tool's frame.
     """
     total = 0.0
     for first, second in zip(_seen(one), _seen(other), strict=True):

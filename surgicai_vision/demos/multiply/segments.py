@@ -1,14 +1,14 @@
-"""Segments: a demonstration cut into pieces that belong to one object each, and one re-posed.
+"""Segments: a demonstration cut into pieces that belong to one object each, and their re-posing.
 
     source = read_source("demos/episode_000000.safetensors")    # `cuts`
     for segment in source.segments["insert"]:
         path = segment.reposed(moment)      # (n, 4, 4) in world, where the objects are now
 
-As in MimicGen (Mandlekar et al., CoRL 2023) a piece is a path relative to the pose that its object
-has when the piece begins. What lies before a piece is not copied but interpolated, so a piece is
-only the end of a way that matters (SkillMimicGen, Garrett et al., CoRL 2024). What moves is the
-tool or, once it holds the needle, a frame on the needle: another start holds it elsewhere and at
-another tilt, and the same path of the tool would miss the hole.
+As in MimicGen (Mandlekar et al., CoRL 2023), a piece is a path relative to the pose that its object
+has when the piece begins. The motion before a piece is not copied but interpolated, so a piece is
+only the part of a motion that matters, its end (SkillMimicGen, Garrett et al., CoRL 2024). What
+moves is the tool or, once it holds the needle, a frame on the needle: from another start the tool
+holds the needle elsewhere and at another tilt, and the same tool path would miss the hole.
 
 | subtask | piece | what moves | relative to |
 |---|---|---|---|
@@ -21,11 +21,11 @@ another tilt, and the same path of the tool would miss the hole.
 | pullout | out of the tissue | needle | the path through the holes |
 | | to the end | needle's grasped point | the end point |
 
-Paths are those of the commands, not of the measured tool, as MimicGen's are: they hold what presses
-and what leads. In the tissue the holes leave no choice, so a path there is the turn about the wound
-and what it is off the ideal path (`demos.expert.on_path`); of a needle of another size the turns
-keep their shares between entry, exit and end. A recording that strays further from the ideal path
-than the openings allow (SurgicAI's own do) keeps its turns alone.
+As in MimicGen, paths are those of the commands, not of the measured tool, so they include how far
+a command presses or leads. In the tissue the holes leave no choice, so a path there consists of the
+turn about the wound and the offset from the ideal path (`demos.expert.on_path`). For a needle of
+another size, the turns keep their shares between entry, exit and end. A recording that strays
+further from the ideal path than the openings allow (SurgicAI's own do) keeps only its turns.
 """
 
 from collections.abc import Callable, Mapping
@@ -50,7 +50,7 @@ Array = NDArray[np.float64]
 OUT_TURN = np.radians(12.0)
 """How far past the exit the pull-out turns the needle's base [rad], as the expert does."""
 STILL = 1e-6
-"""A command that changes less is a pause [m, rad]."""
+"""A command that changes by less than this is a pause [m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Moment:
         needle: T_world_needle (4, 4).
         tip: T_world_tip of the active arm (4, 4).
         stitch: the path through the holes.
-        grasp_angle: the needle's point that a grasp is to meet [rad].
+        grasp_angle: the needle's point to be grasped [rad].
     """
 
     arm: str
@@ -82,19 +82,19 @@ def lying_needle(moment: Moment) -> Array:
 
 
 def grasp_of(moment: Moment) -> Array:
-    """Return T_world_tip of the grasp that is asked for."""
+    """Return T_world_tip of the requested grasp."""
     return moment.needle @ grasp_in_needle(
         moment.arm, moment.grasp_angle, radius=moment.stitch.radius
     )
 
 
 def at_entry(moment: Moment) -> Array:
-    """Return where the needle's tip is in the entry, perpendicular to it, in world."""
+    """Return the frame of the needle's tip in the entry, perpendicular to it, in world."""
     return moment.stitch.place() @ tip_of_needle(moment)
 
 
 def at_end(moment: Moment) -> Array:
-    """Return where the needle's grasped point ends when it is pulled out, in world."""
+    """Return the frame of the needle's grasped point at the end of the pull-out, in world."""
     return moment.stitch.pulled() @ grasped_point(moment)
 
 
@@ -122,8 +122,8 @@ class FreeSegment:
         body: the frame on the needle that moves, T_needle_body; None: the tool moves.
         path: T_object_body (n, 4, 4).
         jaw: commanded jaw angle, (n,) [rad].
-        step: control step of each in the demonstration, (n,).
-        keeps_pauses: its pauses are kept.
+        step: control step of each pose in the demonstration, (n,).
+        keeps_pauses: whether its pauses are kept.
     """
 
     object: Frame
@@ -148,7 +148,7 @@ class TissueSegment:
         off: its pose relative to that on the ideal path, (n, 4, 4).
         knots: turns of the demonstration's needle at entry, circle, exit and end, (4,) [rad].
         jaw: commanded jaw angle, (n,) [rad].
-        step: control step of each in the demonstration, (n,).
+        step: control step of each pose in the demonstration, (n,).
     """
 
     turn: Array
@@ -178,7 +178,7 @@ class Source:
 
     Attributes:
         digest: sha256 of its file.
-        keeps_time: what it does belongs to the time at which it does it.
+        keeps_time: whether its actions are tied to the times at which they happened.
         start: where the objects were at its start.
         segments: subtask → its pieces, in order.
     """
@@ -190,9 +190,9 @@ class Source:
 
 
 def turn_knots(stitch: Stitch) -> Array:
-    """Return the turns about the wound at which a needle's way changes, (4,) [rad].
+    """Return the turns about the wound at which a needle's motion changes, (4,) [rad].
 
-    They are: tip in the entry, on the circle, driven through the exit, wholly out.
+    They are: tip in the entry, on the circle, driven through the exit, completely out.
     """
     pivot = turn_about_wound(stitch.place(), stitch.on_arc(stitch.tip_angle))
     driven = stitch.angle_at_entry(stitch.insert_angle, INSERT_DEPTH + EXTRA)
@@ -207,7 +207,7 @@ def moment_of(env: SuturingEnv, arm: str, subtask: str, keeps_time: bool) -> Mom
         env: the env.
         arm: the active arm.
         subtask: the present subtask.
-        keeps_time: the goal of a grasp is not known: angles count from the needle's base.
+        keeps_time: the goal of a grasp is unknown, so angles are measured from the needle's base.
     """
     simulation = env.simulation
     angle = env.stitch.handoff_angle

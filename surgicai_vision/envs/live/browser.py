@@ -2,13 +2,13 @@
 
 `core.web` serves it. Besides the status and the images there is
 
-    GET  curves?after=N     JSON: {"episode", "points": [[mm, N], …], "next"}; points after the Nth
-                            of all that were ever shown, and of the present episode alone
+    GET  curves?after=N     JSON: {"episode", "points": [[mm, N], …], "next"}; the points of the
+                            present episode after the Nth point of all episodes
     POST input              JSON: {"command": name, "numbers": [float], "views": [name]}
 
-A page sends commands and changes nothing by itself: who steps the env takes them (`commands`) and
-what became of them is in the next status. `VIEW_COMMANDS` are about what is seen, `PLAY_COMMANDS`
-about what runs.
+A page sends commands and changes nothing by itself: whoever steps the env takes them (`commands`),
+and the next status shows their effect. `VIEW_COMMANDS` control what is shown, `PLAY_COMMANDS` what
+runs.
 """
 
 import threading
@@ -29,13 +29,13 @@ PAUSED = "paused"
 ENDED = "ended"
 STOPPED = "stopped"
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
-"""Shares of real time."""
+"""Playback speeds, as shares of real time."""
 FREE = "free"
 """The view of the free camera."""
 MAX_VIEWS = 6
 """Views shown at the same time."""
 VIEW_COMMANDS = MappingProxyType({"views": 0, "turn": 2, "shift": 2, "zoom": 1, "home": 0})
-"""Command → how many numbers it has."""
+"""Command → how many numbers it takes."""
 PLAY_COMMANDS = MappingProxyType(
     {
         "play": 0,
@@ -50,18 +50,18 @@ PLAY_COMMANDS = MappingProxyType(
 )
 FOLDER = Path(__file__).parent / "page"
 WAITING = 256
-"""Commands that wait at most; what comes then is dropped."""
+"""Most commands that may wait; further ones are dropped."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """What a page asks for.
+    """A request from a page.
 
     Attributes:
-        name: of `VIEW_COMMANDS` or `PLAY_COMMANDS`.
+        name: a key of `VIEW_COMMANDS` or `PLAY_COMMANDS`.
         numbers: "turn": right and down [deg]; "shift": right and down [share of the image]; "zoom":
             factor of the distance; "speed": one of `SPEEDS`; "go_on": 1 or 0.
-        views: "views": those shown from now on, the leading one first.
+        views: "views": the views to show from now on, the leading one first.
     """
 
     name: str
@@ -76,16 +76,16 @@ class LiveStatus:
     Attributes:
         state: "playing", "paused", "ended" or "stopped".
         message: what happened and what to do, one line.
-        views: shown, the leading one first.
+        views: the views shown, the leading one first.
         episode: number of the episode, from 1 on.
-        seed: its start.
+        seed: seed of its start.
         limit: control steps it may take.
         is_procedure: the task is all five subtasks in a row.
         moment: what is measured now.
-        speed: share of real time that is asked for.
-        reached: share of real time at which it really plays; 0 where it does not play.
-        go_on: the next start begins by itself.
-        successes, episodes: counts of the episodes that have ended.
+        speed: requested share of real time.
+        reached: share of real time actually reached; 0 if it is not playing.
+        go_on: the next start begins automatically.
+        successes, episodes: counts over the episodes that have ended.
         points: points of the curves shown so far, in all episodes.
     """
 
@@ -111,9 +111,9 @@ class LivePage(ScreenPage):
 
     Args:
         title: what is watched, in a few words.
-        views: all that may be shown; the free camera comes besides.
-        controls: whether somebody takes `PLAY_COMMANDS`; else the page has no buttons for them.
-        port: to listen at; 0 takes any.
+        views: all views that may be shown; the free camera is added to them.
+        controls: whether `PLAY_COMMANDS` are handled; if not, the page has no buttons for them.
+        port: port to listen on; 0 takes any free one.
 
     Raises:
         InputError: the port is not free.
@@ -142,7 +142,7 @@ class LivePage(ScreenPage):
 
     @property
     def points(self) -> int:
-        """Return the number of points of the curves, of all episodes."""
+        """Return the number of points of the curves in all episodes."""
         with self._lock:
             return self._begin + len(self._points)
 
@@ -166,7 +166,7 @@ class LivePage(ScreenPage):
             return {"episode": self._episode, "points": points, "next": total}
 
     def commands(self) -> list[Command]:
-        """Return what pages have asked for since the last call."""
+        """Return the commands that pages have sent since the last call."""
         with self._lock:
             waiting = self._waiting
             self._waiting = []
@@ -176,7 +176,7 @@ class LivePage(ScreenPage):
         """Take a page's command.
 
         Raises:
-            InputError: it is none.
+            InputError: it is not a valid command.
         """
         command = read_command(content, self._allowed, self.views)
         with self._lock:
@@ -189,8 +189,8 @@ def read_command(content: object, allowed: Mapping[str, int], views: Sequence[st
 
     Args:
         content: {"command": name, "numbers": [float], "views": [name]}.
-        allowed: command → how many numbers it has.
-        views: all that may be shown.
+        allowed: command → how many numbers it takes.
+        views: all views that may be shown.
     """
     if not isinstance(content, dict):
         raise InputError("A command must be a table.")

@@ -1,7 +1,8 @@
-"""Human: `render_mode="human"`: an env shows itself while somebody else steps it.
+"""Human: `render_mode="human"`: an env displays itself while other code steps it.
 
-In MuJoCo's window where there is a display, else on a page of this machine's own, whose address it
-prints. Both run at real time at most. The page has no buttons of a player: who steps the env plays.
+It uses MuJoCo's window if there is a display, else a page served by this machine, whose address it
+prints. Both run at real time at most. The page has no playback buttons: the code that steps the env
+is the player.
 """
 
 import sys
@@ -46,7 +47,7 @@ class Human:
         self.step(info)
 
     def step(self, info: Info) -> None:
-        """Show the state that a step ended in, at real time."""
+        """Show the state after a step, in real time."""
         if self._window and self._window.is_open:
             self._window.draw()
         elif self._page:
@@ -54,7 +55,7 @@ class Human:
         self._pacer.wait()
 
     def close(self) -> None:
-        """Close the window, or end the page."""
+        """Close the window or the page."""
         if self._window:
             self._window.close()
         if self._page:
@@ -84,7 +85,7 @@ class _PageOfEnv:
         self._live.begin(self._episode)
 
     def step(self, info: Info, pacer: Pacer) -> None:
-        """Take the measures of a step, and draw if a page waits for it."""
+        """Record the measures of a step, and draw if a page is waiting for an image."""
         self._steps += 1
         if self._steps:
             self._monitor.update(info)
@@ -97,7 +98,7 @@ class _PageOfEnv:
             self._live.screen.show(self._views.render(), self._status(ENDED if ended else PLAYING))
 
     def close(self) -> None:
-        """Show that it is over."""
+        """Show that the env was closed, and stop."""
         if self._info:
             self._live.screen.show(self._views.render(), self._status(STOPPED))
         self._live.__exit__()

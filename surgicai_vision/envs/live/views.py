@@ -1,4 +1,4 @@
-"""Views: what is drawn of an env that is watched: any cameras, and one that a person moves."""
+"""Views: the images of an env being watched, from any cameras and one that a person moves."""
 
 from typing import TYPE_CHECKING, final
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class LiveViews:
     """Draws the views that are shown, in the thread that steps the env.
 
-    It has a renderer of its own: the env's observations have another size.
+    It has its own renderer, because the env's observations have another size.
 
     Args:
         env: the env.
@@ -31,14 +31,14 @@ class LiveViews:
         self.orbit = Orbit()
         self._env = env
         if (size, size) == env.view.image_size:
-            # Renderers of one size share their GPU objects, and so the needle of an episode before.
+            # Renderers of one size share GPU objects, and so the needle of an earlier episode.
             size += 2
         self._size = (size, size)
         self._rig = Rig(env.simulation, env.calibration)
         self._draws = env.simulation.draws
 
     def handle(self, command: Command) -> bool:
-        """Follow a command; return False where it is none of `VIEW_COMMANDS`."""
+        """Follow a command; return False if it is not one of `VIEW_COMMANDS`."""
         if command.name not in VIEW_COMMANDS:
             return False
         if command.name == "views":

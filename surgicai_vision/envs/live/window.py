@@ -1,6 +1,6 @@
-"""Window: MuJoCo's own viewer beside an env that is stepped, where a display exists.
+"""Window: MuJoCo's own viewer of an env while it is stepped, if there is a display.
 
-The viewer has its own mouse: drag to turn, right button to shift, wheel to come nearer; Tab and
+The viewer has its own mouse controls: drag to turn, right button to shift, wheel to zoom; Tab and
 F1 show its menus and its keys.
 """
 
@@ -20,25 +20,25 @@ from surgicai_vision.scene.orbit import Orbit
 KEYS = MappingProxyType(
     {32: "play", 262: "step", ord("N"): "next", ord("R"): "again", 45: "slower", 61: "faster"}
 )
-"""GLFW's key codes → what they ask of a player: space, →, N, R, − and =."""
+"""GLFW's key code → what it requests of a player: space, →, N, R, − and =."""
 CLOSING_S = 5.0
-"""Time that the viewer gets to close [s]."""
+"""Time allowed for the viewer to close [s]."""
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
 def has_display() -> bool:
-    """Return True if this process has been told of a display."""
+    """Return True if this process's environment names a display."""
     return any(os.environ.get(name) for name in DISPLAYS)
 
 
 def check_display() -> None:
-    """Raise `InputError` where there is no display for a window, or none opens on it."""
+    """Raise `InputError` if there is no display for a window, or none opens on it."""
     if not has_display():
         raise InputError(
             f"A window needs a display, and none of {', '.join(DISPLAYS)} is set; leave --window "
             "out to watch in a browser, also from another machine."
         )
-    # The viewer's thread would fail alone, and its caller wait for ever.
+    # Otherwise the viewer's thread would fail unnoticed and its caller would wait for ever.
     with warnings.catch_warnings(action="ignore"):
         opens = glfw.init()
         if opens:
@@ -60,8 +60,8 @@ def check_display() -> None:
 class Window:
     """MuJoCo's viewer of one env. Use it as a context manager.
 
-    It shows a copy of the env's data: opening it and dragging bodies with the mouse change nothing
-    of an episode.
+    It shows a copy of the env's data: opening it and dragging bodies with the mouse do not affect
+    the episode.
 
     Args:
         model: the env's.
@@ -109,14 +109,14 @@ class Window:
         self._viewer.sync()
 
     def pressed(self) -> list[str]:
-        """Return what was asked for by keys since the last call, values of `KEYS`."""
+        """Return what keys have requested since the last call, as values of `KEYS`."""
         with self._lock:
             pressed = self._pressed
             self._pressed = []
             return pressed
 
     def close(self) -> None:
-        """Close the window, and wait for its thread: GLFW breaks if the process ends before."""
+        """Close the window and wait for its thread: GLFW breaks if the process ends first."""
         self._viewer.close()
         for thread in self._threads:
             thread.join(CLOSING_S)

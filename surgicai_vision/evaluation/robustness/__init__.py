@@ -1,6 +1,6 @@
 """Robustness: the same policy on the same starts while one thing at a time shifts.
 
-`axes` says what can shift, `corrupted_agent` sees spoilt images (`core.corruption`), `curves`
+`axes` says what can shift, `corrupted_agent` sees corrupted images (`core.corruption`), `curves`
 evaluates a policy along the axes.
 """
 

@@ -1,12 +1,12 @@
-"""Axes: what can shift, and how far strength 1 goes. A new axis is one line of `AXES`.
+"""Axes: what can shift, and how far strength 1 goes. A new axis is one entry of `AXES`.
 
 An axis changes the world, by the randomisation the env already has (`config.RandomisationConfig`),
-or only the images the agent is given (`core.corruption`); `all` does everything at once. In the
-world every episode draws its own direction from its seed, uniform in ± the axis's size; the
-strength scales the size. It comes on top of the task's own randomisation of the axis.
+or only the images the agent is given (`core.corruption`); `all` applies every axis at once. In the
+world, every episode draws its own shift from its seed, uniform in ± the axis's size; the strength
+scales the size. The shift is added to the task's own randomisation of the axis.
 
-Strength 1 is where a person still recognises the scene, barely; `surgicai-vision scene --axes FILE`
-draws every axis at every strength.
+At strength 1 a person can only just recognise the scene; `surgicai-vision scene --axes FILE` draws
+every axis at every strength.
 """
 
 import dataclasses
@@ -38,10 +38,10 @@ class Axis:
     """What shifts at strength 1.
 
     Attributes:
-        text: what it is, for people.
+        text: what it is, in words.
         world: field of `config.RandomisationConfig` → what is added to it.
-        images: keys of `core.corruption.CORRUPTIONS`, in the order in which they spoil an image.
-        seen: whether it changes images only, so that a policy without them cannot notice it.
+        images: keys of `core.corruption.CORRUPTIONS`, in the order in which they are applied.
+        seen: whether it changes only images, so that a policy without images is unaffected.
     """
 
     text: str
@@ -108,17 +108,17 @@ AXES: Mapping[str, Axis] = MappingProxyType(
     }
 )
 """Axis → what strength 1 means. The largest kinematic error is that of the surgical robotics
-challenge; the others are ours: the plain image is just about recognisable at strength 1."""
+challenge; the others are ours: at strength 1 the plain image is only just recognisable."""
 
 
 def axes_of(spec: "PolicySpec") -> tuple[str, ...]:
-    """Return the axes that can change what a policy does: without images only those of the arm."""
+    """Return the axes that can affect a policy; without images, only those not marked `seen`."""
     images = bool(spec.run.views)
     return tuple(name for name, axis in AXES.items() if images or not axis.seen)
 
 
 def shifted(spec: "PolicySpec", axis: str, strength: float) -> "PolicySpec":
-    """Return the policy in a world, or behind images, that shifted by `strength` along `axis`.
+    """Return the policy with its world, or its images, shifted by `strength` along `axis`.
 
     Args:
         spec: what is evaluated in which task.
@@ -134,7 +134,7 @@ def shifted(spec: "PolicySpec", axis: str, strength: float) -> "PolicySpec":
     chosen = AXES[axis]
     make = spec.make
     if spec.run.views:
-        # The agent made last sees the image first.
+        # The outermost agent, made last, sees the image first.
         for kind in reversed(chosen.images):
             make = functools.partial(_corrupted, make, kind, strength)
     env = shifted_config(spec.config, chosen, strength)
@@ -153,5 +153,5 @@ def shifted_config(config: TaskConfig, axis: Axis, strength: float) -> TaskConfi
 
 
 def _corrupted(make: MakeAgent, kind: str, strength: float) -> Agent:
-    """Make the agent behind a corruption (in a worker process)."""
+    """Make an agent that sees through a corruption (in a worker process)."""
     return CorruptedAgent(make(), CORRUPTIONS[kind], strength)

@@ -52,11 +52,11 @@ class CorruptedAgent(Agent):
         self._agent.reset(slot, robot, seed)
 
     def restart(self, slot: int) -> None:
-        """Tell the agent behind; the slot's steps count on."""
+        """Restart the wrapped agent; the slot's step count goes on."""
         self._agent.restart(slot)
 
     def share(self, features: FeatureTable) -> None:
-        """Let the agent behind share features."""
+        """Let the wrapped agent share features."""
         self._agent.share(features)
 
     def act(
@@ -72,7 +72,7 @@ class CorruptedAgent(Agent):
         return self._agent.act(slots, robots, seen)
 
     def _seen(self, slot: int, observation: Observation) -> Observation:
-        """Return an observation whose images are changed when they are looked at."""
+        """Return an observation whose images are corrupted when they are accessed."""
         if not self.cameras:
             return observation
         moments = {

@@ -1,11 +1,11 @@
 """Curves: successes of a policy against how far one thing shifts from its training conditions.
 
 `robustness(spec, seeds, out)` evaluates every axis of `axes.AXES` at every strength, one
-evaluation folder each (`<out>/<axis>/<strength>/`), and writes `robustness.parquet`: a row for
+evaluation folder each (`<out>/<axis>/<strength>/`). It writes `robustness.parquet`: one row for
 every axis and strength with its successes, interval, retention (the share of the plain successes
-that is left, on the same starts), and the axis's area under the curve. Every strength has the same
-starts, and an episode's shift keeps its direction and grows with the strength, so that strengths
-are paired. Strength 0 is the plain evaluation.
+that is left, on the same starts) and the axis's area under the curve. All strengths use the same
+starts, and an episode's shift keeps its direction and grows with the strength, so strengths are
+paired. Strength 0 is the plain evaluation.
 """
 
 import itertools
@@ -44,14 +44,14 @@ def robustness(
 ) -> list[Row]:
     """Evaluate `spec` along every axis into `out` and return the rows of `robustness.parquet`.
 
-    What is there already is kept, so running again continues, also with more axes or strengths.
+    Existing results are kept, so running again continues, also with more axes or strengths.
 
     Args:
         spec: what is evaluated in which task.
         seeds: start seeds, the same at every strength.
         out: folder to make or to continue.
         stage: shows progress.
-        axes: keys of `AXES`; none takes all that change what the policy sees or does (`axes_of`).
+        axes: keys of `AXES`; empty takes all that change what the policy sees or does (`axes_of`).
         strengths: each from 0 to 1, increasing.
         workers: processes.
 
@@ -87,7 +87,7 @@ def robustness(
 
 
 def _checked(spec: PolicySpec, axes: Sequence[str], strengths: Sequence[float]) -> tuple[str, ...]:
-    """Return the axes to evaluate; refuse what cannot be."""
+    """Return the axes to evaluate; refuse axes or strengths that cannot be."""
     possible = axes_of(spec)
     for axis in axes:
         check_name("axis", axis, AXES)
@@ -110,7 +110,7 @@ def _list(items: Sequence[object]) -> str:
 
 
 def _claim(out: Path, spec: PolicySpec, seeds: Sequence[int]) -> None:
-    """Write who is evaluated where into `out`, or refuse a folder of another one."""
+    """Record in `out` what is evaluated on which starts; refuse the folder of something else."""
     mine = {
         "run": to_mapping(spec.run),
         "checkpoint": spec.about.get("checkpoint"),
@@ -121,7 +121,7 @@ def _claim(out: Path, spec: PolicySpec, seeds: Sequence[int]) -> None:
 
 
 def _copy(plain: Path, folder: Path, axis: str) -> None:
-    """Make the evaluation at strength 0 of one more axis: the plain one, which is the same."""
+    """Copy the plain evaluation as the one at strength 0 of another axis, which is the same."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in plain.iterdir():
         if path.name != MARKER:

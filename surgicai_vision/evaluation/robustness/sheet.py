@@ -1,6 +1,6 @@
 """Sheet: what every axis does to an image, from strength 0 to 1, for people to judge.
 
-Latency and what else no image shows is left out.
+Axes that no image shows, such as latency, are left out.
 """
 
 from collections.abc import Sequence

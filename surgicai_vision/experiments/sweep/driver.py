@@ -1,4 +1,4 @@
-"""Driver: what runs share is made first, each thing once; then the runs, side by side.
+"""Driver: make what runs share first, each thing once; then do the runs side by side.
 
 A finished job is filed by one rename from `work/` to its place. A sweep that was killed in between
 finds it in `work/`.
@@ -52,9 +52,9 @@ from surgicai_vision.training.run_config import RunConfig
 EPISODES, PROBES = "episodes.parquet", "probes.parquet"
 WORK = "work"
 EVALUATION = "evaluation"
-"""Folder of a run's episodes, beside its result."""
+"""Folder of a run's episodes, next to its result."""
 ATTEMPTS = 3
-"""How often a run is started whose worker dies."""
+"""How often a run is started if its worker dies."""
 
 
 def run_sweep(
@@ -71,15 +71,15 @@ def run_sweep(
         experiment: the runs, a grid or a plan.
         out: folder to make or to continue.
         context: processes, engine and progress; the result does not depend on them.
-        attempts: how often a run is started whose worker dies.
-        choice: the runs to work on; others that are not there yet are left for another call.
-        device: where it is encoded and trained, one of `features.devices.DEVICES`; by default
-            encoded on a GPU where there is one, and trained on the CPU.
+        attempts: how often a run is started if its worker dies.
+        choice: the runs to work on; others that are not done yet are left for another call.
+        device: where to encode and train, one of `features.devices.DEVICES`; by default a GPU
+            encodes, if there is one, and the CPU trains.
 
     Returns:
         {"runs", "done" (by this call), "cached", "failed", "not_run", "left", "failed_beside" (the
         references and probes that failed), "digest" (of all rows there are), "problems": one line
-        for each run that failed or was not done, and for what failed beside them}.
+        for each failed run, reason why runs were not done, and failed reference or probe}.
 
     Raises:
         InputError: `out` cannot be written, or another sweep is at work in it.
@@ -128,7 +128,7 @@ def run_sweep(
 
 
 def _open(experiment: Experiment, out: Path) -> None:
-    """Make the folder, or accept the one of the same experiment, in which nothing is changed."""
+    """Make the folder, or accept that of the same experiment and change nothing in it."""
     files.check_output(out, may_resume=GRID_FILE)
     if (out / GRID_FILE).exists():
         _stored(experiment, out)
@@ -144,13 +144,13 @@ def _open(experiment: Experiment, out: Path) -> None:
 
 
 def _extend(experiment: Experiment, out: Path) -> None:
-    """Store what is added to the experiment of the folder, which this call holds alone."""
+    """Store what is added to the folder's experiment; this call has claimed the folder."""
     if _stored(experiment, out).table() != experiment.table():
         _store_table(experiment, out)
 
 
 def _stored(experiment: Experiment, out: Path) -> Experiment:
-    """Return the experiment of the folder, or refuse one that does not go on as this one."""
+    """Return the experiment of the folder, or refuse one that cannot be continued as this one."""
     stored = read_experiment_of(out)
     if stored.kind != experiment.kind or not experiment.extends(stored.table()):
         raise OutputExists(
@@ -192,10 +192,10 @@ class _Sweep:
 
     Attributes:
         experiment, out, context, attempts: as `run_sweep`'s.
-        references: what is not trained and wanted beside the runs.
+        references: the untrained references to evaluate alongside the runs.
         device: as `run_sweep`'s.
         errors: run's key → what went wrong, in one line.
-        problems: what went wrong beside the runs.
+        problems: what went wrong outside the runs.
     """
 
     experiment: Experiment
@@ -212,7 +212,7 @@ class _Sweep:
         self._renew()
 
     def _renew(self) -> None:
-        """Look at the folder anew: digests of datasets are parts of keys."""
+        """Read the folder again: digests of datasets are parts of keys."""
         ours = {
             name: value for name, value in os.environ.items() if name.startswith("SURGICAI_VISION_")
         }
@@ -221,7 +221,7 @@ class _Sweep:
     def prepare(self, to_do: Sequence[RunState]) -> None:
         """Make the datasets, features and policies that runs share.
 
-        A dataset that fails fails its runs.
+        If a dataset fails, so do its runs.
         """
         users = {state.key: self.jobs.datasets_of(state.run) for state in to_do}
         replayed = [
@@ -280,7 +280,7 @@ class _Sweep:
     def _share(self, title: str, jobs: Iterable[Job]) -> dict[str, SurgicaiError]:
         """Do jobs, each once; return the errors by key.
 
-        What failed here fails again in the run and is told there.
+        What fails here fails again in the run and is reported there.
         """
         once = {job.key(): job for job in jobs}
         errors: dict[str, SurgicaiError] = {}
@@ -353,7 +353,7 @@ class _Sweep:
             self._run("runs", left, ended)
 
     def probe(self, runs: Sequence[RunConfig]) -> None:
-        """Probe what the runs see, where the grid asks for it."""
+        """Probe what the runs see, if the grid requests it."""
         wanted = self.jobs.probes(runs) if self.experiment.probe else {}
         places = {
             job.key(): _Place(self.out / "probes" / name, PROBE_FILE)
@@ -381,9 +381,9 @@ class _Sweep:
         return self.out / "references" / "-".join(parts)
 
     def _fail(self, state: RunState, error: SurgicaiError) -> None:
-        """Keep a run's error, and its traceback where it was none of ours.
+        """Store a run's error, with the traceback where it was none of ours.
 
-        A result that other code or other data gave is removed: it counts no longer.
+        A result of other code or other data is removed: it is no longer valid.
         """
         folder = run_folder(self.out, state.key)
         folder.mkdir(parents=True, exist_ok=True)
@@ -407,7 +407,7 @@ def _file(folder: Path, place: _Place, key: str) -> None:
     shutil.rmtree(place.folder, ignore_errors=True)
     os.rename(folder, place.folder)
     files.sync_folder(place.folder.parent)
-    # Filed, so what a killed training would have gone on from is no longer needed.
+    # Filed, so the state from which a killed training would resume is no longer needed.
     shutil.rmtree(folder.parent.parent / TRAINING / key, ignore_errors=True)
 
 
@@ -424,14 +424,14 @@ def _collect(experiment: Experiment, out: Path) -> list[Row]:
 
 
 def _collect_probes(out: Path) -> None:
-    """Write `probes.parquet` of all probes there are, one row an encoder and view set."""
+    """Write `probes.parquet` of all probes there are, one row per encoder and view set."""
     rows = [files.read_json(path) for path in sorted(out.glob(f"probes/*/{PROBE_FILE}"))]
     if rows:
         files.write_bytes(out / PROBES, parquet_bytes(rows))
 
 
 def _about(run: RunConfig) -> Row:
-    """Return what a row says of its run."""
+    """Return what a row says about its run."""
     return {
         "run": run_key(run),
         "encoder": run.encoder,
@@ -449,7 +449,7 @@ def _about(run: RunConfig) -> Row:
 def _store_run(
     experiment: Experiment, out: Path, problems: list[str], skipped: Sequence[RunState]
 ) -> None:
-    """Write what the report says of the sweep; only when something changed."""
+    """Write what the report says about the sweep; only when something changed."""
     old = files.read_json(out / RUN_FILE) if (out / RUN_FILE).exists() else {}
     made = {
         "format": FORMAT,

@@ -1,4 +1,4 @@
-"""Estimate: how long the rest of a sweep takes, by what its finished runs took."""
+"""Estimate: how long the rest of a sweep takes, judged by its finished runs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,12 +9,12 @@ from surgicai_vision.experiments.sweep.plan import TO_DO, RunState, run_folder
 
 
 def estimate(states: Sequence[RunState], out: Path, workers: int) -> float | None:
-    """Return the seconds that the runs to be done take; None before the first is finished.
+    """Return the seconds that the remaining runs will take; None before the first is finished.
 
     Args:
         states: the sweep's runs.
         out: the sweep's folder.
-        workers: runs at a time.
+        workers: runs done at a time.
     """
     paths = [run_folder(out, state.key) / RESULT_FILE for state in states]
     taken: list[float] = [

@@ -1,11 +1,11 @@
 """Experiment: what a sweep does, as data.
 
-Two kinds of file say it: a grid (`grid.Grid`), every combination of its axes; and a plan
-(`experiments.plan_config.Plan`), a set of policies rebuilt from nothing for several training seeds
-and evaluated in several conditions.
+Two kinds of file describe it: a grid (`grid.Grid`, `rl_grid.RLGrid`), every combination of its
+axes; and a plan (`experiments.plan_config.Plan`), a set of policies rebuilt from scratch for
+several training seeds and evaluated in several conditions.
 
 An experiment consists of runs. A run either trains its policy on one of the datasets and evaluates
-it, or evaluates policies that are trained before and that runs share (its parts).
+it, or evaluates policies that were trained before and that runs share (its parts).
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,8 +26,8 @@ class Training:
         run: what is trained.
         dataset: name of the dataset it is trained on.
         subtask: train on this subtask's frames of whole procedures.
-        encodes_all: encode every frame of the dataset, for other policies see them too; else the
-            subtask's alone.
+        encodes_all: encode every frame of the dataset, as other policies see them too; else only
+            the subtask's.
     """
 
     run: RunConfig
@@ -38,7 +38,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """How a run is evaluated, where that is not as its policies were trained.
+    """How a run is evaluated, where that differs from how its policies were trained.
 
     Attributes:
         env: fields of `TaskConfig`; empty keeps the env the policies were trained in.
@@ -50,7 +50,7 @@ class Evaluated:
 
 
 class Experiment(Protocol):
-    """What a sweep asks of its file."""
+    """What a sweep needs from its file."""
 
     @property
     def kind(self) -> str:
@@ -62,7 +62,7 @@ class Experiment(Protocol):
 
     @property
     def datasets(self) -> Mapping[str, DatasetConfig]:
-        """Name of each dataset, its folder below `data/` → what it is."""
+        """Name of each dataset (its folder below `data/`) → what it is."""
 
     @property
     def learners(self) -> Mapping[str, Training]:
@@ -90,21 +90,21 @@ class Experiment(Protocol):
         """Return the policies that a run evaluates, by their names; empty if it trains its own."""
 
     def needs(self, run: RunConfig) -> str:
-        """Return what a run needs that no machine of ours has; "" where it may be run."""
+        """Return what a run needs that no machine of ours has; "" where it can be run."""
 
     def evaluated(self, run: RunConfig) -> Evaluated:
         """Return how a run is evaluated."""
 
     def references(self, runs: Sequence[RunConfig]) -> tuple[RunConfig, ...]:
-        """Return what is not trained and stands beside these runs."""
+        """Return the untrained references that are evaluated alongside these runs."""
 
     def table(self) -> Mapping[str, JSON]:
-        """Return it as plain data."""
+        """Return the experiment as plain data."""
 
     def extends(self, stored: Mapping[str, JSON]) -> bool:
-        """Return True if a folder of the same kind of experiment, `stored`, may go on as this one.
+        """Return True if `stored`, an experiment of the same kind, may be continued as this one.
 
-        Everything the folder holds must be the same here.
+        Everything that it contains must be the same here.
         """
 
     def smaller(
@@ -114,7 +114,7 @@ class Experiment(Protocol):
         episodes: int | None = None,
         size: int | None = None,
     ) -> Self:
-        """Return it with other numbers, to try it in minutes.
+        """Return the experiment with other numbers, to try it in minutes.
 
         Args:
             demonstrations: of each dataset.
@@ -125,10 +125,10 @@ class Experiment(Protocol):
 
 
 def check_runs(runs: Sequence[RunConfig]) -> None:
-    """Refuse a grid without runs, and one in which a run stands twice.
+    """Refuse a grid without runs, and one in which a run occurs twice.
 
     Raises:
-        InputError: so many runs, so many of them different.
+        InputError: how many runs there are, and how many of them are different.
     """
     different = len(set(runs))
     if not runs or different != len(runs):

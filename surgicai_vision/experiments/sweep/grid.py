@@ -46,25 +46,25 @@ AXES: Mapping[str, Callable[[RunConfig], object]] = MappingProxyType(
         "hierarchical": lambda run: run.termination,
     }
 )
-"""Keys of a grid that hold lists, and a run's value on each; one value alone may be written without
+"""Keys of a grid that hold lists, and a run's value on each; a single value may be written without
 brackets.
 """
 HIGH_LEVEL: Mapping[str, str] = MappingProxyType(
     dict.fromkeys(("best", "endoscope", "unmoved"), "high-level")
 )
-"""Recipe of the low-level policies → the high-level policy's; any other trains both, as the paper's
-does.
+"""Recipe of the low-level policies → the high-level policy's; any other recipe trains both, as the
+paper's does.
 """
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """What is replaced in each run that sees, alone and all else kept; what is None stays.
+    """What is replaced in each run that sees, with all else kept; None replaces nothing.
 
     Attributes:
         encoder, view, pool, recipe: a run's.
-        change: what is changed in the recipe besides.
-        demonstrations: train on the first so many.
+        change: what else is changed in the recipe.
+        demonstrations: train on this many, the first ones.
     """
 
     encoder: str | None = None
@@ -104,39 +104,39 @@ class Grid:
 
     Attributes:
         task: tasks.
-        encoder: encoders; `own` for policies that train a network of their own on the images
+        encoder: encoders; `own` for policies that train their own network on the images
             (`act`, `diffusion`).
         view: view sets, each a list of views.
         seed: training seeds.
         policy: policies: those of `train`, and LeRobot's `act` and `diffusion`.
-        recipe: recipes of the former.
+        recipe: recipes of the policies of `train`.
         pool: what is taken from the encoders.
-        ablation: what is replaced one at a time in each run that sees, beside the whole.
-        demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies
-            within the larger.
+        ablation: what is replaced, one at a time, in copies of each run that sees.
+        demonstrations: numbers of the demonstrations of each task; a smaller set is contained in a
+            larger one.
         demonstrator: who demonstrates: `expert`, or `search`, which does not know the goal of a
             grasp.
-        noise: what they execute is disturbed by so much (`record-demos --noise`).
+        noise: noise on the actions they execute (`record-demos --noise`).
         post_success_steps: control steps that demonstrations go on after their success.
         randomisation: what differs from episode to episode besides the start, in demonstrations and
             evaluations.
-        frame_stride: frames are rendered every so many steps; recipes must then take them so.
-        hierarchical: add, for the whole procedure, a high-level policy over a policy for each
-            subtask, by how subtasks end: `privileged` or `learned`.
-        expert_swap: add each such policy with the expert in the place of each subtask's policy.
+        frame_stride: control steps from frame to frame; that of each recipe must be a multiple.
+        hierarchical: for the whole procedure, add a high-level policy over one policy per subtask
+            for each way in which subtasks may end: `privileged` or `learned`.
+        expert_swap: also add each hierarchical policy with the expert in each subtask in turn.
         accept_licence: accept weights under a non-commercial licence.
         proprioception: add a run without images for each task and seed.
         state: add a run that sees the state with the goal, an upper bound, for each task and seed.
-        expert: evaluate the expert on each task beside the runs.
-        replay: evaluate a replay of the mean demonstration, which observes nothing, too.
+        expert: evaluate the expert on each task alongside the runs.
+        replay: also evaluate a replay of the mean demonstration, which observes nothing.
         probe: probe the encoders' features for the needle's pose.
-        epochs: passes over the frames; none takes the recipe's.
+        epochs: passes over the frames; None takes the recipe's.
         steps: updates of LeRobot's policies.
-        batch: their batch size.
+        batch: batch size of LeRobot's policies.
         starts: the bank of the evaluation's starts, one of `BANKS`.
         episodes: starts of each evaluation.
         size: height and width of images [px].
-        depth: render depth beside RGB; done by itself where a view is a depth view.
+        depth: render depth as well as RGB; automatic where a view is a depth view.
     """
 
     task: tuple[str, ...]
@@ -241,7 +241,7 @@ class Grid:
             return
         ours = replace(common, policy=policy)
         for encoder, views, recipe in itertools.product(self.encoder, self.view, self.recipe):
-            if encoder != OWN:  # for policies that see images themselves
+            if encoder != OWN:  # which is for policies that see the images themselves
                 yield replace(ours, encoder=encoder, views=views, recipe=recipe, pool=self.pool)
         for recipe in self.recipe:
             if self.proprioception:
@@ -366,7 +366,7 @@ class Grid:
         )
 
     def table(self) -> Mapping[str, JSON]:
-        """Return it as plain data."""
+        """Return the grid as plain data."""
         return to_mapping(self)
 
     def extends(self, stored: Mapping[str, JSON]) -> bool:
@@ -406,7 +406,7 @@ class Grid:
 
 
 def parts_of(run: RunConfig) -> dict[str, RunConfig]:
-    """Return the policies of a hierarchical run: "hlp", and each subtask's but the one swapped.
+    """Return the policies of a hierarchical run: "hlp", and each subtask's except the one swapped.
 
     The high-level policy has its own recipe where `HIGH_LEVEL` names one.
     """

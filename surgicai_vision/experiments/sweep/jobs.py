@@ -1,7 +1,7 @@
 """Jobs of a sweep, as workers do them.
 
 Encode, train a policy that runs share, do a run, evaluate a reference. Each writes into its own
-folder and reads datasets and cache by path. Nothing here depends on who does it.
+folder and reads datasets and cache by path. Nothing here depends on which worker does it.
 """
 
 import dataclasses
@@ -88,7 +88,7 @@ def train_and_evaluate(
     command: str,
     environment: Mapping[str, str],
 ) -> None:
-    """Job "sweep-run": train a policy, or take those made before, and count its successes."""
+    """Job "sweep-run": train a policy, or take those made before, and evaluate it."""
     os.environ.update(environment)
     what = _run(run)
     weights = WeightsSource(accept_licence=accept_licence)
@@ -115,7 +115,7 @@ def train_and_evaluate(
 def evaluate_reference(
     folder: Path, run: Table, dataset: str, command: str, environment: Mapping[str, str]
 ) -> None:
-    """Job "sweep-reference": evaluate what is not trained."""
+    """Job "sweep-reference": evaluate an untrained reference."""
     os.environ.update(environment)
     what = _run(run)
     demonstrated = _dataset(dataset) if what.policy == "replay" else None
@@ -135,7 +135,7 @@ def run_probe(
     command: str,
     environment: Mapping[str, str],
 ) -> None:
-    """Job "sweep-probe": say what of the needle's pose can be read from what a run sees."""
+    """Job "sweep-probe": measure how well what a run sees predicts the needle's pose."""
     os.environ.update(environment)
     what = _run(run)
     data = _dataset(dataset)
@@ -168,7 +168,7 @@ def _trained(
 
 
 def evaluate_as(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) -> dict[str, JSON]:
-    """Evaluate what is called and stored as `run`, in the env of `spec`."""
+    """Evaluate `spec` in its env, named and stored as `run`."""
     assert run.starts is not None, "the experiment says where a run is evaluated"
     stored = evaluated_in(run, spec.config, run.shift)
     spec = dataclasses.replace(spec, run=stored, about=about)
@@ -176,7 +176,7 @@ def evaluate_as(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) ->
 
 
 def _shifted(spec: PolicySpec, run: RunConfig) -> PolicySpec:
-    """Return a policy in the shift that its run says."""
+    """Return a policy under the shift of its run, if there is one."""
     return shifted(spec, run.shift.axis, run.shift.strength) if run.shift else spec
 
 

@@ -1,8 +1,8 @@
-"""LeRobot's policies as runs: `lerobot-train` in a process of its own.
+"""LeRobot's policies as runs: `lerobot-train` in a separate process.
 
-It sees images or exported features.
+The policy sees images or exported features.
 
-Its checkpoint is evaluated as `surgicai-vision evaluate` does. LeRobot is not imported here.
+Its checkpoint is evaluated as by `surgicai-vision evaluate`. LeRobot is not imported here.
 """
 
 import json
@@ -48,14 +48,14 @@ OPTIONS = {
         "--policy.scheduler_warmup_steps=100",
     ),
 }
-"""What a policy is given besides LeRobot's defaults.
+"""Options of a policy that differ from LeRobot's defaults.
 
-Widths and plans are much as by the recipes `act` and `diffusion`: a core trains such networks in
-half an hour (docs/results/yardstick.md).
+Widths and plans are much like those of the recipes `act` and `diffusion`: one core trains such
+networks in half an hour (docs/results/yardstick.md).
 
-ACT plans half a second and acts on its first tenth; for each frame of a plan LeRobot decodes an
-image (docs/upstream.md), so that a shorter one also trains faster. A backbone starts from random
-weights here, and LeRobot's learning rate for it, 1e-5, is for pretrained ones.
+ACT plans half a second and executes the first tenth of a second. LeRobot decodes an image for each
+frame of a plan (docs/upstream.md), so a shorter plan also trains faster. A backbone starts from
+random weights here, and LeRobot's learning rate for it, 1e-5, is meant for pretrained ones.
 """
 SCRATCH = "export"
 VARIABLES = {**OFFLINE, "HF_DATASETS_DISABLE_PROGRESS_BARS": "1", "WANDB_MODE": "disabled"}
@@ -80,8 +80,8 @@ def train_lerobot(
         device: where to encode and train, one of `features.devices.DEVICES`; the CPU by default.
 
     Raises:
-        InputError: a dataset without every step's frame.
-        SurgicaiError: LeRobot failed; the message ends with the last of what it said.
+        InputError: a dataset without a frame of every step.
+        SurgicaiError: LeRobot failed; the message ends with its last output.
     """
     if dataset.fps != names.FPS:
         raise InputError(
@@ -94,7 +94,7 @@ def train_lerobot(
     arguments = _arguments(run, dataset, root, out)
     where = find_device(device or CPU)
     if where == CPU:
-        arguments.append("--num_workers=0")  # LeRobot's four would take the cores that train
+        arguments.append("--num_workers=0")  # LeRobot's four workers would take cores that train
     arguments += [
         f"--policy.device={where}",
         f"--steps={run.updates}",
@@ -109,7 +109,7 @@ def train_lerobot(
 def _export(
     run: RunConfig, dataset: RenderedDataset, root: Path, weights: WeightsSource, device: str
 ) -> None:
-    """Write a dataset with the run's features in place of images."""
+    """Write a dataset with the run's features instead of images."""
     encoder = load_encoder(str(run.encoder), run.pool, weights, device)
     rows = [encode(dataset, view, encoder).rows for view in run.views]
     about = {

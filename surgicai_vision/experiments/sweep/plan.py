@@ -1,4 +1,4 @@
-"""Plan: which runs there are, what stands in the folder already, and the job that makes each."""
+"""Plan: which runs there are, what is in the folder already, and the job that makes each."""
 
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -30,7 +30,7 @@ from surgicai_vision.training.run_config import OWN, RunConfig
 REFERENCE_FILE = "reference.json"
 PROBE_FILE = "probe.json"
 TRAINING = "training"
-"""Folder of a sweep in which trainings work, one folder a job."""
+"""Folder of a sweep in which trainings work, one folder per job."""
 TO_DO: Final = "to do"
 CACHED: Final = "cached"
 NOT_RUN: Final = "not run"
@@ -52,7 +52,7 @@ EVALUATE = (*LEARN, "evaluation")
 RL = ("scene", "envs", "demos", "training", "experiments", "policies", "evaluation", "rl")
 PACKAGES = ("mujoco", "numpy", "torch", "timm", "lerobot")
 RL_PACKAGES = ("mujoco", "numpy", "torch", "stable-baselines3", "sb3-contrib", "d3rlpy")
-"""Sources and distributions that decide what a job of a sweep gives."""
+"""Sources and distributions that decide the result of a sweep's job."""
 for name, function, stages in (
     ("sweep-features", "encode_features", LEARN),
     ("sweep-policy", "train_policy", LEARN),
@@ -79,7 +79,7 @@ class RunState:
     Attributes:
         run: the run.
         key: its folder's name.
-        state: one of `STATES`; "left" is a run that this call was not asked for.
+        state: one of `STATES`; "left" is a run that this call did not choose.
         reason: why it is not run, or why it is done again.
     """
 
@@ -99,7 +99,7 @@ class RunState:
 
 
 def lacking(states: Sequence[RunState]) -> dict[str, list[RunState]]:
-    """Return why runs are not run → these runs; each reason once."""
+    """Return each reason why runs are not run → these runs."""
     runs: dict[str, list[RunState]] = {}
     for state in states:
         if state.state == NOT_RUN:
@@ -142,9 +142,9 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
 
     Raises:
         UnknownName: a recipe, or a change of one, that does not exist.
-        InputError: a recipe that is fed progress, which no sweep says, a policy that chooses
-            subtasks where one that acts is needed, a dataset that cannot be recorded or rendered,
-            or upsets in a task that has none.
+        InputError: a recipe with progress as an input, which no sweep provides, a policy that
+            chooses subtasks where one that acts is needed, a dataset that cannot be recorded or
+            rendered, or upsets in a task that has none.
     """
     if any(run.algo for run in experiment.runs):
         check_extra("A sweep over algorithms", *LIBRARIES)
@@ -170,7 +170,7 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
 def trained_by(experiment: Experiment, run: RunConfig) -> list[RunConfig]:
     """Return the policies that must be trained for a run.
 
-    These are its parts, or its own, and the learners that act in what they are trained on.
+    These are its parts, or its own policy, and the learners that act in their demonstrations.
     """
     parts = experiment.parts(run).values()
     own = [part.run for part in parts] or [run]
@@ -194,7 +194,7 @@ def _check_acts(policy: str) -> None:
 
 
 def _missing(encoder: str, weights: WeightsSource) -> str:
-    """Return why an encoder's weights cannot be had, or "" where they are at hand."""
+    """Return why an encoder's weights are not available, or "" where they are at hand."""
     try:
         encoders.find_weights(encoder, weights)
     except MissingWeights as error:
@@ -227,9 +227,9 @@ class Jobs:
     Args:
         experiment: the grid or the plan.
         out: the sweep's folder.
-        command: the command to be named beside each result.
-        environment: variables for the workers, where an engine does not hand ours on.
-        device: where it is encoded and trained, one of `features.devices.DEVICES`.
+        command: the command to store with each result.
+        environment: variables for the workers, where an engine does not pass ours on.
+        device: where to encode and train, one of `features.devices.DEVICES`.
     """
 
     def __init__(
@@ -344,7 +344,7 @@ class Jobs:
         return self._with_scratch(Job("sweep-rl", arguments, inputs, label=RL_LABELS))
 
     def _learning(self, run: RunConfig) -> dict[str, JSON]:
-        """Return the arguments that jobs of learning share."""
+        """Return the arguments that jobs of reinforcement and offline learning share."""
         experiment = self.experiment
         assert isinstance(experiment, RLGrid)
         demos = self.data_folder(experiment.dataset_of(run)) / "demos"
@@ -362,7 +362,7 @@ class Jobs:
         return tuple(self.dataset_digest(name) or "" for name in self.datasets_of(run))
 
     def _with_scratch(self, job: Job) -> Job:
-        """Name the folder in which a killed training is gone on with: no other job's."""
+        """Add the folder in which a killed training continues; no other job uses it."""
         scratch = str((self.out / TRAINING / job.key()).absolute())
         return replace(job, arguments={**job.arguments, "scratch": scratch})
 
@@ -440,7 +440,7 @@ class Jobs:
 
 
 LABELS = ("dataset", "accept_licence", "device", "command", "environment")
-"""Arguments that change where and how a job is done, and not its result."""
+"""Arguments that change where and how a job is done, but not its result."""
 RL_LABELS = (*LABELS, "final", "policies", "demos", "scratch")
 LIBRARIES = ("stable_baselines3", "sb3_contrib", "d3rlpy")
 """What a sweep over algorithms imports."""

@@ -1,8 +1,8 @@
 """Grid of reinforcement and offline learning: what a sweep's YAML file with `algo` says.
 
 Every combination of task, algorithm, number of demonstrations and training seed is a run: an actor
-on the state, trained by `rl.train` and counted from the starts of a bank. Demonstrations are
-recorded once a task and not rendered; a run with fewer takes the first of them.
+on the state, trained by `rl.train` and evaluated from the starts of a bank. Demonstrations are
+recorded once per task and not rendered; a run with fewer takes the first of them.
 
     task: [grasp, handoff]
     algo: [td3-her-bc, rlpd]
@@ -14,8 +14,8 @@ recorded once a task and not rendered; a run with fewer takes the first of them.
     hierarchical: true                # the whole procedure, over the actors of each algorithm
     decisions: 1500                   # of PPO as its high-level policy (Table 3)
 
-An algorithm that learns from no demonstrations has one run a task and seed, whatever their numbers.
-Light to import: no library of reinforcement learning.
+An algorithm that learns from no demonstrations has one run per task and seed, whatever their
+numbers. Light to import: no library of reinforcement learning.
 """
 
 import functools
@@ -47,23 +47,23 @@ class RLGrid:
         task: subtasks.
         algo: keys of `rl.algorithms.ALGORITHMS`.
         seed: training seeds.
-        demonstrations: how many are learned from; the smaller set lies within the larger.
-        noise: what the demonstrating expert executes is disturbed by so much.
+        demonstrations: how many are learned from; a smaller set is contained in a larger one.
+        noise: noise on the actions that the demonstrating expert executes.
         observation: what the actors see of the state, "relative" or "state".
         env_steps: control steps of online algorithms.
         updates: updates of offline algorithms.
         change: algorithm, or task → settings that are changed for it, "key=value" each; a task's
             come after an algorithm's, and every algorithm must read them.
         env: fields of `TaskConfig` for demonstrations, training and evaluation alike.
-        validation: episodes of each evaluation on the way, from validation starts.
-        save_every: control steps (offline: updates) from one to the next, and between the states
-            that a killed training goes on from.
+        validation: episodes of each evaluation during training, from validation starts.
+        save_every: control steps (offline: updates) between these evaluations, and between the
+            states that a killed training resumes from.
         hierarchical: add, for each algorithm, number of demonstrations and seed, the whole
             procedure by PPO over the actors of that seed; needs all five subtasks.
         decisions: decisions that PPO learns from.
         starts: the bank of the evaluation's starts, one of `BANKS`.
         episodes: starts of each evaluation.
-        expert: evaluate the expert on each task beside the runs.
+        expert: evaluate the expert on each task alongside the runs.
     """
 
     task: tuple[str, ...]
@@ -205,14 +205,14 @@ class RLGrid:
         }
 
     def _post_success_steps(self, task: str) -> int:
-        """Return the control steps recorded after a success, where one must hold: twice as many."""
+        """Return the control steps recorded after a success: twice those it must hold, if any."""
         changed = (settings_of(algo, read_changes(self._changes(algo, task))) for algo in self.algo)
         most = max(settings.success_steps for settings in changed)
         return 2 * most if most > 1 else 0
 
     @property
     def accept_licence(self) -> bool:
-        """Return False: nothing here has weights of others."""
+        """Return False: no third-party weights are used."""
         return False
 
     @property
@@ -230,7 +230,7 @@ class RLGrid:
         return run.task
 
     def parts(self, run: RunConfig) -> Mapping[str, Training]:
-        """Return the actors of a whole procedure, trained once; the rows of actors share them."""
+        """Return the actors of a run, trained once: procedures and rows of actors share them."""
         if not self.hierarchical:
             return {}
         assert run.algo is not None
@@ -255,11 +255,11 @@ class RLGrid:
         )
 
     def table(self) -> Mapping[str, JSON]:
-        """Return it as plain data."""
+        """Return the grid as plain data."""
         return to_mapping(self)
 
     def extends(self, stored: Mapping[str, JSON]) -> bool:
-        """Return True if `stored` is the same but for tasks, algorithms and seeds added here."""
+        """Return True if `stored` is the same except for tasks, algorithms and seeds added here."""
         axes = ("task", "algo", "seed")
         mine = self.table()
         rest = {name: value for name, value in mine.items() if name not in axes}
@@ -274,7 +274,7 @@ class RLGrid:
         episodes: int | None = None,
         size: int | None = None,
     ) -> "RLGrid":
-        """Return the grid with other numbers; `epochs` and `size` it has none of."""
+        """Return the grid with other numbers; it has no `epochs` and no `size`."""
         for name, value in (("epochs", epochs), ("size", size)):
             if value is not None:
                 raise InputError(f"A sweep over algorithms has no {name}; leave --{name} out.")

@@ -1,8 +1,8 @@
 """Jobs of a sweep over algorithms, as workers do them; see `rl_grid`.
 
-A training works in `scratch`, a folder that no other job has, and goes on there when the sweep that
-was killed is called again; its checkpoint and curve are then copied to the job's own folder. The
-sweep removes it once the result is filed.
+A training works in `scratch`, a folder that no other job uses, and continues there if a killed
+sweep is run again. Its checkpoint and curve are then copied to the job's own folder. The sweep
+removes `scratch` once the result is filed.
 """
 
 import os
@@ -57,9 +57,9 @@ def train_and_evaluate(
     command: str,
     environment: Mapping[str, str],
 ) -> None:
-    """Job "sweep-rl": train an actor, or PPO over actors made before, and count its successes.
+    """Job "sweep-rl": train an actor, or PPO over actors made before, and evaluate it.
 
-    An actor that whole procedures share was trained before, and is counted alone here.
+    An actor that whole procedures share was trained before, and is only evaluated here.
     """
     os.environ.update(environment)
     what = from_mapping(RunConfig, run)
@@ -86,7 +86,7 @@ def train_and_evaluate(
 
 
 def _train(run: RunConfig, demos: str, validation: int, save_every: int, scratch: Path) -> Path:
-    """Train an actor, or go on with it; return the folder of its checkpoint."""
+    """Train an actor, or continue its training; return the folder of its checkpoint."""
     assert run.algo is not None, "a sweep over algorithms has runs of algorithms alone"
     paths = list_demos(Path(demos))[: run.demonstrations] if demos else []
     request = Request(
@@ -110,7 +110,7 @@ def _train(run: RunConfig, demos: str, validation: int, save_every: int, scratch
 def _procedure(
     run: RunConfig, policies: Mapping[str, str], decisions: int, validation: int, scratch: Path
 ) -> PolicySpec:
-    """Train PPO over the low-level policies, or go on with it; return the whole."""
+    """Train PPO over the low-level policies, or continue it; return the hierarchical policy."""
     low = from_mapping(
         HierarchicalConfig, {**policies, "hlp": ORDER, "termination": run.termination}, "procedure"
     )

@@ -1,7 +1,7 @@
 """Selection: the runs of a grid that one call works on, by its axes (`sweep --only`).
 
-A choice maps an axis to values in words: those of `view` are joined by "+", what a run has none of
-is "none".
+A choice maps an axis to values as text: several views are joined by "+", and "none" stands for a
+run without a value.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -43,7 +43,7 @@ def read_choice(texts: Iterable[str], runs: Sequence[RunConfig]) -> Choice:
 
 
 def is_chosen(run: RunConfig, choice: Choice) -> bool:
-    """Return True if a run has one of the values of every axis that is chosen by."""
+    """Return True if a run has one of the chosen values on every axis of `choice`."""
     return all(_value(run, axis) in values for axis, values in choice.items())
 
 

@@ -1,1 +1,1 @@
-"""Visual: what only meets the eye: materials, shapes, textures, the skin, the instruments."""
+"""Visual: what is only seen: materials, shapes, textures, the skin, the instruments."""

@@ -2,20 +2,20 @@
 
 Interface:
 
-* `Appearance(family, seed)` is the whole identity of a look. The family "" is the plain look that
-  the scene was compiled with; the others are `names.APPEARANCES`. With `share`, `other` and
-  `other_seed` it is a mixture of two. `Appearance.numbers` are the floats that a state holds for
-  it, and `Appearance.of_numbers` is its inverse.
+* `Appearance(family, seed)` fully identifies a look. The family "" is the plain look that the scene
+  was compiled with; the others are `names.APPEARANCES`. With `share`, `other` and `other_seed` it
+  is a mixture of two. `Appearance.numbers` are the floats that a state holds for it, and
+  `Appearance.of_numbers` is the inverse.
 * `draw_look(appearance) -> Look`: colours, finishes and light. Cheap.
-* `draw_textures(appearance) -> {texture: image}`: what the surfaces show, of fixed sizes. 30 to 80
-  ms, kept for the last few appearances.
-* `apply(source, model, appearance)` writes the look, and the appearance's numbers, into a model of
-  one's own. The textures are not drawn then: a `FrameRenderer` reads the numbers before each frame
-  (`shown`), and draws and uploads the textures when they are others than it has (`paint`). So an
+* `draw_textures(appearance) -> {texture: image}`: the images on the surfaces, of fixed sizes. Takes
+  30 to 80 ms; kept for the last few appearances.
+* `apply(source, model, appearance)` writes the look, and the appearance's numbers, into the
+  caller's own model. It draws no textures: a `FrameRenderer` reads the numbers before each frame
+  (`shown`), and draws and uploads the textures when they differ from those it has (`paint`). So an
   env that renders nothing draws nothing, and every renderer of a model shows its look.
 
-Nothing here touches physics. All is drawn from seeded integers by arithmetic that IEEE fixes: an
-appearance is the same in every process and on every machine.
+Nothing here touches physics. Everything is drawn from seeded integers by arithmetic that IEEE
+fixes: an appearance is the same in every process and on every machine.
 """
 
 import functools
@@ -39,9 +39,9 @@ NUMBERS = "appearance"
 SEEDS = 1 << 31
 """Seeds are below this, so that a float holds them exactly."""
 KEPT = 8
-"""Appearances whose textures a process keeps, 1.3 MB each."""
+"""How many appearances' textures a process keeps, 1.3 MB each."""
 SPOT_DISTANCE = 0.14
-"""Distance from the endoscope at which its spot has its strength [m]: about the holes."""
+"""Distance from the endoscope at which its spot has its stated strength [m]: near the holes."""
 SPOT_CAMERAS = ("endo_left", "front")
 """The first of these that a scene has carries the spot."""
 WHITE: Image = np.full((1, 1, 3), 255, np.uint8)
@@ -54,7 +54,7 @@ SIZES: Mapping[str, Size] = {
 }
 """Texture → its height and width [pixel], the same in every look."""
 TEXTURED = {"tissue": "tissue", "drape": "drape", "tray": "tray", "steel": "metal", "jaw": "metal"}
-"""Material → its texture. The plain look has the first two alone."""
+"""Material → its texture. The plain look has only the first two."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Appearance:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Return family, seed, share, other family and its seed; a family as its place, from 1."""
+        """Return family, seed, share, other family and its seed; a family by its index, from 1."""
         return (
             *(float(_place(self.family)), float(self.seed)),
             *(self.share, float(_place(self.other)), float(self.other_seed)),
@@ -99,7 +99,7 @@ class Appearance:
 
 
 def _place(family: str) -> int:
-    """Return a family's place in `names.APPEARANCES`, from 1; 0 for the plain look."""
+    """Return a family's index in `names.APPEARANCES`, from 1; 0 for the plain look."""
     return names.APPEARANCES.index(family) + 1 if family else 0
 
 
@@ -114,7 +114,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp's colour times strength, and where it shines to."""
+    """A lamp's colour times its strength, and the direction in which it shines."""
 
     diffuse: Vector
     specular: Vector
@@ -130,7 +130,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Look:
-    """Everything of an appearance but its textures."""
+    """Everything in an appearance except its textures."""
 
     materials: Mapping[str, Material]
     ambient: Vector
@@ -167,7 +167,7 @@ def draw_look(appearance: Appearance) -> Look:
 
 @functools.lru_cache(maxsize=KEPT)
 def draw_textures(appearance: Appearance) -> Mapping[str, Image]:
-    """Draw the textures of an appearance, (height, width, 3) uint8 each; not to be written.
+    """Draw the textures of an appearance, (height, width, 3) uint8 each; do not modify them.
 
     The plain look has two; the slots of the others are white in it.
     """
@@ -194,7 +194,7 @@ def draw_textures(appearance: Appearance) -> Mapping[str, Image]:
 
 
 def _mixed(own: Image, other: Image, share: float) -> fields.Field:
-    """Return `own` with a share of `other`."""
+    """Return `own` mixed with a share of `other`."""
     first: fields.Field = np.asarray(own, np.float32)
     second: fields.Field = np.asarray(other, np.float32)
     mixed: fields.Field = first + np.float32(share) * (second - first)
@@ -215,7 +215,7 @@ def apply(source: mujoco.MjModel, model: mujoco.MjModel, appearance: Appearance)
 
 
 def _fields(model: mujoco.MjModel) -> list[NDArray[np.float64]]:
-    """Return what of a model an appearance decides, but textures and which lights are on."""
+    """Return a model's fields that an appearance sets, except textures and which lights are on."""
     headlight = model.vis.headlight
     return [
         *(model.mat_rgba, model.mat_specular, model.mat_shininess),
@@ -270,7 +270,7 @@ def carry_spot(model: mujoco.MjModel) -> None:
 
 
 def shown(model: mujoco.MjModel) -> NDArray[np.float64]:
-    """Return the numbers of a model's appearance, a view; empty if it has no looks."""
+    """Return the numbers of a model's appearance as a view; empty if it has no looks."""
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, NUMBERS)
     if index < 0:
         return np.zeros(0)
@@ -279,7 +279,7 @@ def shown(model: mujoco.MjModel) -> NDArray[np.float64]:
 
 
 def paint(model: mujoco.MjModel, context: mujoco.MjrContext) -> None:
-    """Draw the textures of the model's appearance and give them to an OpenGL context."""
+    """Draw the textures of the model's appearance and upload them to an OpenGL context."""
     for name, image in draw_textures(Appearance.of_numbers(*shown(model))).items():
         texture = model.texture(name)
         start = int(model.tex_adr[texture.id])

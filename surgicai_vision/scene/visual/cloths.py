@@ -1,6 +1,6 @@
 """Cloths: textures of drapes, trays and instruments, drawn from a generator.
 
-A pattern is a function of (rng, size) that returns an image (height, width, 3) uint8 that tiles.
+A pattern is a function of (rng, size) that returns a tiling image (height, width, 3) uint8.
 """
 
 import numpy as np
@@ -71,7 +71,7 @@ def film(rng: np.random.Generator, size: Size = CLOTH_SIZE) -> Image:
 
 
 def checked(rng: np.random.Generator, size: Size = CLOTH_SIZE) -> Image:
-    """Draw reinforced drape: violet-grey with a grid of thick threads."""
+    """Draw a reinforced drape: violet-grey with a grid of thick threads."""
     base = mixed(rng, (96.0, 84.0, 124.0), (84.0, 88.0, 104.0))
     image = shaded(fractal(rng, size, 8, 8, 3), darker(base, 0.82), darker(base, 1.08))
     grid = np.maximum(np.arange(size[0])[:, None] % 32 < 3, np.arange(size[1]) % 32 < 3)

@@ -1,17 +1,17 @@
-"""Distractors: what else lies about: a second needle, gauze, a clip, cut thread, blood.
+"""Distractors: other things that lie around: a second needle, gauze, a clip, cut thread, blood.
 
 Interface:
 
-* `Litter(count, seed)` is the identity of what lies about in one episode, `draw(litter)` the places
-  of its things.
-* `add_distractors(spec)` gives a scene `MOST` hidden geoms of a body of their own, "distractors";
-  `scatter(source, model, litter)` turns the first of them into the things drawn, and `seen` says
+* `Litter(count, seed)` identifies what lies around in one episode; `draw(litter)` returns the
+  things with their places.
+* `add_distractors(spec)` gives a scene `MOST` hidden geoms on a separate body, "distractors";
+  `scatter(source, model, litter)` turns the first of them into the things drawn, and `seen` returns
   how many are shown.
 
-They are seen and nothing else: they neither collide nor weigh. In a segmentation they are
-background, a second needle too. They lie on the tissue and on the drape beside the tray, clear of
-the ridge (`BAND`), of where the needle starts (`START`) and of each other. Their body stands where
-what lies on the phantom stands: it is shifted and turned with it.
+They are only seen: they do not collide and have no mass. In a segmentation they are background, a
+second needle too. They lie on the tissue and on the drape next to the tray, clear of the ridge
+(`BAND`), of where the needle starts (`START`) and of each other. Their body is posed like anything
+that lies on the phantom: it is shifted and turned with it.
 """
 
 import math
@@ -34,32 +34,32 @@ from surgicai_vision.scene.visual.shapes import HIDDEN, VISIBLE, Mesh
 
 BODY = "distractors"
 MOST = 5
-"""Most of them in one episode."""
+"""Largest number of distractors in one episode."""
 LIFT = 0.00015
-"""Above what they lie on [m], so that it does not shine through."""
+"""Height above what they lie on [m], so that it does not show through."""
 TRIES = 80
-"""Draws of a free place before another kind is drawn."""
+"""Attempts at drawing a free place before another kind is drawn."""
 GAP = 0.001
-"""Free way between two of them [m]."""
+"""Free distance between two of them [m]."""
 
 BAND = 0.014
-"""Half of the width of the strip along the wound that stays free [m]: the ridge and the way of a
+"""Half of the width of the strip along the wound that stays free [m]: the ridge and the path of a
 needle through it."""
 START = (needle.HOME[0] - 0.017, needle.HOME[0] + 0.017, needle.HOME[1] - 0.034, 0.200)
-"""Where needles start, x from, x to, y from, y to [m]: their radius and spread about `HOME`; the
-strip beyond, which the endoscope's image ends with, is left free."""
+"""Where needles start, x from, x to, y from, y to [m]: their radius and spread about `HOME`. The
+strip beyond, at the edge of the endoscope's image, is left free."""
 ROWS = (-0.005, 0.097)
-"""From which y to which they lie [m]: what both world views show."""
+"""Range of y in which they lie [m]: what both world views show."""
 
 ON_TISSUE = 4.0
-"""How much rather than on the drape they lie on the tissue, area for area."""
+"""How many times likelier they are to lie on the tissue than on the drape, per area."""
 
 GAUZE_TEXTURE = (96, 128)
 CLOT = (92.0, 8.0, 12.0)
 
 
 class Zone(NamedTuple):
-    """A rectangle that things lie on [m, world of the scene's own model]; its share of things."""
+    """A rectangle that things lie on [m, world of the scene's own model], and its weight."""
 
     left: float
     right: float
@@ -93,9 +93,9 @@ class Kind:
     """A kind of distractor.
 
     Attributes:
-        mesh: draws it about its middle, lying on z = 0.
+        mesh: returns its mesh around its middle, lying on z = 0.
         material: its material.
-        reach: radius of a circle about its middle that holds it [m].
+        reach: radius of a circle around its middle that encloses it [m].
     """
 
     mesh: Callable[[], Mesh]
@@ -105,7 +105,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class Litter:
-    """What lies about in an episode.
+    """What lies around in an episode.
 
     Attributes:
         count: number of things, 0 to `MOST`.
@@ -167,7 +167,7 @@ def _gauze() -> Mesh:
     height += 0.0006 * (x > 0.15)  # where it is folded over
     height = np.where(edge > 0.99, 0.0, height)
     mesh = Mesh()
-    # rows × columns must be upwards: rows fall in y.
+    # rows × columns must point upwards, so y falls from row to row.
     points = np.stack([0.0075 * x, -0.0055 * y, height], axis=2)
     mesh.add_grid(points, np.stack([(x + 1.0) / 2.0, (y + 1.0) / 2.0], axis=2))
     return mesh
@@ -229,7 +229,7 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
 
 
 def add_distractors(spec: mujoco.MjSpec) -> None:
-    """Add their meshes and materials, and `MOST` hidden geoms to a body of their own."""
+    """Add their meshes and materials, and `MOST` hidden geoms on a separate body."""
     textures.add_texture(spec, "gauze", _gauze_texture())
     gauze = spec.add_material(name="gauze", specular=0.0, shininess=0.0)
     gauze.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "gauze"
@@ -249,9 +249,9 @@ def add_distractors(spec: mujoco.MjSpec) -> None:
 
 
 def draw(litter: Litter) -> list[Thing]:
-    """Draw what lies about: with one seed, fewer are the first of more.
+    """Draw what lies around; with one seed, a smaller count gives the first of a larger one.
 
-    There are fewer things than asked for only where no free place was found.
+    There are fewer things than requested only if no free place was found.
     """
     rng = np.random.default_rng(litter.seed)
     things: list[Thing] = []
@@ -288,7 +288,7 @@ def _free(rng: np.random.Generator, kind: str, others: list[Thing]) -> Thing | N
 
 
 def scatter(source: mujoco.MjModel, model: mujoco.MjModel, litter: Litter) -> None:
-    """Show what lies about in `model`, a copy of the compiled `source`, which is only read."""
+    """Show what lies around in `model`, a copy of the compiled `source`, which is only read."""
     things = draw(litter)
     for index in range(MOST):
         geom = source.geom(f"distractor_{index}").id

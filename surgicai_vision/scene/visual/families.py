@@ -1,9 +1,9 @@
-"""Families: what belongs together in one appearance, and within which bounds an episode draws.
+"""Families: what belongs together in one appearance, and the bounds within which an episode draws.
 
-`FAMILIES` is the table, in the order of `names.APPEARANCES`. A family owns its parts: no pattern,
-finish, lamp or colour of a held-out family is one of a family for training, and tests prove it
-(`tests/scene/test_appearance.py`). Colours are 0 to 255; they and all bounds were chosen by eye on
-the contact sheets (`surgicai-vision scene --looks FILE`), not measured on tissue.
+`FAMILIES` is the table, in the order of `names.APPEARANCES`. No pattern, finish, lamp or colour of
+a held-out family is used in a training family (tested in `tests/scene/test_appearance.py`). Colours
+are 0 to 255; they and all bounds were chosen by eye on the contact sheets (`surgicai-vision scene
+--looks FILE`), not measured on tissue.
 """
 
 from collections.abc import Callable, Mapping
@@ -63,13 +63,13 @@ class Lamps:
 
 @dataclass(frozen=True)
 class Family:
-    """One appearance; an episode draws its own within it.
+    """One family of looks; each episode draws its own look within it.
 
     Attributes:
         tissue: pattern of the skin's texture.
-        wet: the skin's material over it: tint, specular strength, shininess.
+        wet: the skin's material over that texture: tint, specular strength, shininess.
         flesh: the phantom's sides.
-        inside: what shows in a hole.
+        inside: what is visible in a hole.
         ink: the marks.
         drape: pattern of the cloth.
         tray: pattern of the tray; `tray_finish` tints it.

@@ -1,9 +1,9 @@
-"""Fields: seeded noise, cells, lines and relief, of which the textures of every look are made.
+"""Fields: seeded noise, cells, lines and relief, from which the textures of every look are made.
 
-A field is (height, width) float32, mostly in [0, 1], and tiles: its last row goes on in its first.
-Random integers, sums, products, quotients and square roots alone are used, each fixed by IEEE to
-the last bit and taken element by element, so that a seed gives the same bytes on every machine; a
-sine or an exponential differs between processors.
+A field is (height, width) float32, mostly in [0, 1], and tiles: its last row continues in its
+first. Only random integers, sums, products, quotients and square roots are used, each fixed by IEEE
+to the last bit and taken element by element, so that a seed gives the same bytes on every machine.
+A sine or an exponential differs between processors.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 BIRTH = 0.016
-"""Branches of a vessel for each pixel of its length."""
+"""Branches of a vessel per pixel of its length."""
 
 Image = NDArray[np.uint8]
 Field = NDArray[np.float32 | np.float64]
@@ -45,7 +45,7 @@ def fractal(
 
 
 def lines(rng: np.random.Generator, size: Size, rows: int, columns: int, thin: int = 4) -> Field:
-    """Return winding lines, 1 where noise crosses its middle; each `thin` halves their width."""
+    """Return winding lines, 1 where noise crosses its middle, their width halved `thin` times."""
     field = fractal(rng, size, rows, columns, 3)
     folded: Field = 1 - np.abs(2 * field - 1)
     for _ in range(thin):
@@ -54,10 +54,10 @@ def lines(rng: np.random.Generator, size: Size, rows: int, columns: int, thin: i
 
 
 def cells(rng: np.random.Generator, size: Size, rows: int, columns: int) -> tuple[Field, Field]:
-    """Return cells about `rows` × `columns` scattered points.
+    """Return cells around `rows` × `columns` scattered points.
 
     The first field is a random shade of each cell, the second 0 on the border between two of them
-    and about 1 in their middles. Both are drawn at half of the resolution.
+    and about 1 in their middles. Both are drawn at half the resolution.
     """
     height, width = size[0] // 2, size[1] // 2
     place = rng.integers(0, 65536, (2, rows, columns)).astype(np.float32) / 65536
@@ -94,14 +94,14 @@ def trees(
     """Return branching vessels: 1 in their middle, 0 beside them.
 
     Args:
-        rng: what decides their ways.
+        rng: decides their courses.
         size: of the field [pixel].
-        count: trees.
+        count: number of trees.
         steps: length of a stem [pixel].
         width: half of a stem's width [pixel].
         wander: how much a step turns.
-        along: share of a row's direction that stems begin with, 1 across the image, 0 along it; a
-            random direction by default.
+        along: share of the row direction in a stem's first direction: 1 runs across the image, 0
+            along it; a random direction by default.
     """
     field = np.zeros(size, np.float32)
     waiting = []
@@ -160,7 +160,7 @@ def spots(rng: np.random.Generator, size: Size, count: int, smallest: int, large
 
 
 def relief(height: Field, depth: float) -> Field:
-    """Return how much brighter a surface is whose upper left is lit, about 0.
+    """Return the change in brightness (around 0) of a surface lit from the upper left.
 
     Args:
         height: of the surface.
@@ -184,7 +184,7 @@ def glints(height: Field, wet: float) -> Field:
 
 
 def shaded(share: Field, *colours: Colour) -> Field:
-    """Return colours (height, width, 3) along a ramp from the first, where `share` is 0."""
+    """Return colours (height, width, 3) along a ramp; the first is where `share` is 0."""
     ramp = np.array(colours, np.float32)
     place = np.clip(share, 0, 1) * np.float32(len(ramp) - 1)
     first = np.minimum(place.astype(np.int64), len(ramp) - 2)

@@ -30,8 +30,8 @@ from surgicai_vision.scene.visual.shapes import HIDDEN, hide, show
 
 DRAPE_X = (0.04, 0.08, 0.13, 0.19, 0.27, 0.40, 0.60, 0.90)
 """Columns of the drape's points on each side of the phantom's middle [m], closer where the cameras
-look; between the first two, below the phantom, it has a hole, for every hidden pixel costs as much
-as a visible one."""
+look. Between the innermost two, below the phantom, it has a hole, because a hidden pixel costs as
+much as a visible one."""
 DRAPE_WAVE = 0.006
 """Height of its folds [m]."""
 SPOT_NEAR = 0.2
@@ -108,9 +108,9 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
         diffuse=[0.0, 0.0, 0.0],
         specular=[0.0, 0.0, 0.0],
         attenuation=[SPOT_NEAR, 0.0, falloff],
-        castshadow=False,  # it would spot the instruments, and hide behind them
+        castshadow=False,  # its shadows would speckle the instruments, and hide behind them
     )
-    # Times the extent: a smaller shadow map shows stripes towards its edge.
+    # In multiples of the extent: a smaller shadow map shows stripes towards its edge.
     spec.visual.map.shadowclip = 9.0
     spec.add_texture(
         name="sky",

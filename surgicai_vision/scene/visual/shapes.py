@@ -1,4 +1,4 @@
-"""Shapes: triangle meshes from sections and grids, for what only meets the eye.
+"""Shapes: triangle meshes from sections and grids, for what is only seen.
 
 Coordinates are rounded to a nanometre: the last bits of a sine differ between processors, and the
 scene's hash must not.
@@ -19,7 +19,7 @@ HIDDEN = 4
 
 @dataclass
 class Mesh:
-    """Triangles under construction; a texture coordinate goes with each point or with none."""
+    """Triangles under construction; either all points have a texture coordinate or none has."""
 
     points: list[Sequence[float]] = field(default_factory=list)
     faces: list[Sequence[int]] = field(default_factory=list)
@@ -30,7 +30,7 @@ class Mesh:
     ) -> None:
         """Add a grid of points (rows, columns, 3) [m].
 
-        It is seen from the side on which rows × columns is the normal.
+        It is visible from the side to which rows × columns points.
 
         Args:
             coordinates: of the texture, (rows, columns, 2).
@@ -49,14 +49,14 @@ class Mesh:
             self.faces += [(corner, below, below + 1), (corner, below + 1, corner + 1)]
 
     def join(self, other: "Mesh") -> None:
-        """Take in the triangles of another mesh."""
+        """Add the triangles of another mesh."""
         first = len(self.points)
         self.points += other.points
         self.faces += [[first + index for index in face] for face in other.faces]
         self.coordinates += other.coordinates
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
-        """Add the mesh to `spec`. It needs no volume: nothing of it has mass."""
+        """Add the mesh to `spec`. It needs no volume, as it has no mass."""
         mesh = spec.add_mesh(name=name)
         mesh.uservert = np.round(self.points, 9).ravel().tolist()
         mesh.userface = [index for face in self.faces for index in face]
@@ -113,7 +113,7 @@ def bar(sections: Sequence[tuple[float, float, float, float]]) -> Mesh:
 
 
 def block(centre: Sequence[float], half: Sequence[float]) -> Mesh:
-    """Return a box along the axes by its centre and the halves of its sides [m]."""
+    """Return a box along the axes, given its centre and the halves of its sides [m]."""
     x, y, z = half
     mesh = bar([(-z, -y, y, x), (z, -y, y, x)])
     mesh.points = (np.array(mesh.points) + centre).tolist()
@@ -131,14 +131,14 @@ def rod(start: Sequence[float], end: Sequence[float], radius: float, sides: int 
 
 
 def show(body: mujoco.MjsBody, shape: mujoco.mjtGeom, material: str, **place: object) -> None:
-    """Add a geom to `body` that is seen and nothing else: it neither collides nor weighs."""
+    """Add a geom to `body` that is only seen: it does not collide and has no mass."""
     body.add_geom(
         type=shape, material=material, contype=0, conaffinity=0, mass=0.0, group=VISIBLE, **place
     )
 
 
 def hide(body: mujoco.MjsBody, keep: str = "") -> None:
-    """Take a body's physical geoms out of the images, but for one whose name ends with `keep`."""
+    """Hide a body's physical geoms in images, except one whose name ends with `keep`."""
     for geom in body.geoms:
         if not (keep and geom.name.endswith(keep)):
             geom.group = HIDDEN

@@ -2,8 +2,8 @@
 
 At each hole the skin lies on the faces of the boxes; between two hole pairs, whose gaps differ, it
 runs straight where the boxes have a step of up to 0.5 mm. The holes are open, have walls, and show
-a dark inside; a ring of ink marks each as on a training phantom, or those of the pair to be sewn
-alone (`SceneConfig.ink`).
+a dark inside. A ring of ink marks each hole, as on a training phantom, or only those of the pair to
+be sewn (`SceneConfig.ink`).
 """
 
 import math
@@ -20,21 +20,21 @@ from surgicai_vision.scene.visual.shapes import HIDDEN, VISIBLE, Mesh
 Array = NDArray[np.float64]
 
 LIFT = 0.00005
-"""Of the skin above the boxes [m], so that they never shine through it."""
+"""Height of the skin above the boxes [m], so that they never show through it."""
 INK_LIFT = 0.0001
-"""Of the ink above the boxes [m]."""
+"""Height of the ink above the boxes [m]."""
 INK_WIDTH = 0.0009
-"""Of the ring of ink [m]."""
+"""Width of the ring of ink [m]."""
 FILLET = 0.0015
 """Length over which the ridge's foot is rounded [m]."""
 RAMP = 0.0015
 """Length over which the ridge falls at its ends [m]."""
 MARGIN = 0.0012
-"""Along the wound beside a hole, where the skin still lies on the boxes [m]."""
+"""Length along the wound beside a hole where the skin still lies on the boxes [m]."""
 BESIDE = 8
 """Points across the flat tissue on each side of the ridge; lighting is per point."""
 FLAT_ROWS = 7
-"""Rows of points before and behind the ridge."""
+"""Rows of points in front of and behind the ridge."""
 STRIP = 0.0005
 """Length of the row next to the ridge [m]."""
 
@@ -47,27 +47,27 @@ def add_skin(spec: mujoco.MjSpec, layout: str) -> None:
 
 
 def add_ink(spec: mujoco.MjSpec, name: str, pairs: Sequence[HolePair]) -> None:
-    """Add a mesh of rings of ink about the openings of pairs to `spec`."""
+    """Add a mesh of rings of ink around the openings of `pairs` to `spec`."""
     _ink(pairs).add_to(spec, name)
 
 
 def ink_of(number: int) -> str:
-    """Return the name of the ink about pair 1, 2, 3 or 4 alone, a mesh and a geom."""
+    """Return the name, of a mesh and a geom, of the ink around pair 1, 2, 3 or 4 alone."""
     return f"ink{number}"
 
 
 def ink_geoms(model: mujoco.MjModel, layout: str) -> tuple[int, ...]:
-    """Return the ids of the geoms of ink, of pair 1 first, where each pair has its own."""
+    """Return the ids of the ink geoms, pair 1 first, in a model where each pair has its own."""
     numbers = range(1, len(PAIRS[layout]) + 1)
     return tuple(model.geom(ink_of(number)).id for number in numbers)
 
 
 def show_ink(model: mujoco.MjModel, geoms: Sequence[int], pair: int) -> None:
-    """Show the ink about one pair alone.
+    """Show the ink around one pair alone.
 
     Args:
-        model: of an env's own.
-        geoms: what `ink_geoms` returned; none changes nothing.
+        model: an env's own.
+        geoms: what `ink_geoms` returned; if empty, nothing changes.
         pair: index of the pair, 0 to 3.
     """
     for index, geom in enumerate(geoms):
@@ -79,7 +79,7 @@ def flank_line(hole: Hole, height: float, offset: float) -> Array:
 
     Args:
         height: from the hole's centre to the top, along the flank [m].
-        offset: outwards of the boxes [m].
+        offset: outwards from the boxes [m].
     """
     along = hole.rotation[:, 0] * -math.copysign(1.0, hole.tilt)
     normal = hole.rotation[:, 2]
@@ -120,7 +120,7 @@ LEFT_HOLE = BESIDE + 4
 
 
 def _rows(pairs: Sequence[HolePair], profiles: Sequence[Array]) -> list[tuple[float, Array, bool]]:
-    """Return y [m], section and "a hole begins here", from +y to -y."""
+    """Return y [m], section and "a hole begins here" of each row, from +y to -y."""
     edges = piece_edges(tuple(pairs))
     rows = []
     for pair, profile in zip(pairs, profiles, strict=True):
@@ -149,7 +149,7 @@ def _rows(pairs: Sequence[HolePair], profiles: Sequence[Array]) -> list[tuple[fl
 
 
 def flattened(profile: Array) -> Array:
-    """Return the section where the ridge has ended."""
+    """Return the section beyond the end of the ridge."""
     flat = profile.copy()
     flat[:, 1] = SURFACE + LIFT
     return flat
@@ -188,8 +188,8 @@ def _inside(pairs: tuple[HolePair, ...]) -> Mesh:
         )
         for near, far in zip(outer, inner, strict=True):
             _add_walls(mesh, near[1:3], far[1:3], pair.entry.centre[1])
-    # Column 1 of `_flank` is the lower edge of a hole: 1..2 on the left, 6..7 on the right of nine
-    # points.
+    # Column 1 of `flank_line` is the lower edge of a hole: 1..2 on the left, 6..7 on the right of
+    # nine points.
     rows = [
         (y, section, opens) for y, section, opens in _rows(pairs, sections)[FLAT_ROWS:-FLAT_ROWS]
     ]
@@ -218,7 +218,7 @@ def _add_walls(mesh: Mesh, near: Array, far: Array, y: float) -> None:
 
 
 def _ink(pairs: Sequence[HolePair]) -> Mesh:
-    """Return a flat ring about every hole."""
+    """Return a flat ring around every hole."""
     mesh = Mesh()
     reach = np.array([-OPENING / 2 - INK_WIDTH, -OPENING / 2, OPENING / 2, OPENING / 2 + INK_WIDTH])
     keep = np.ones((3, 3), bool)

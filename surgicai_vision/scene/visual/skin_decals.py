@@ -13,28 +13,28 @@ from surgicai_vision.scene.visual.skin_state import Array, Pull, Wound, displace
 Faces = NDArray[np.int64]
 
 MARK_LIFT = 0.00006
-"""Of the ink above the skin [m]."""
+"""Height of the ink above the skin [m]."""
 WOUND_LIFT = 0.00012
-"""Of wounds above the skin [m]; of the reddened skin about them halfway between."""
+"""Height of wounds above the skin [m]; the reddened skin around them lies halfway between."""
 RISE = 0.12
 """Further lift of ink and wounds, per displacement of the skin: between its lines the drawn skin is
-flat, and would hide what follows its bell exactly."""
+flat, and would hide points that follow the bell exactly."""
 ARM = (0.0014, 0.0022)
-"""Half the length of a mark's two strokes [m], others and of the pair to be sewn."""
+"""Half the length of a mark's two strokes [m]: of other pairs, and of the pair to be sewn."""
 STROKE = (0.00025, 0.0004)
 """Half of their width [m]."""
 STROKE_PARTS = 8
 """Parts of a stroke, which bends with the skin."""
 WOUNDS = 16
-"""Wounds that can be shown: two for each bite that soft tissue remembers."""
+"""How many wounds can be shown: two for each bite that soft tissue remembers."""
 WOUND = 0.00045
 """Half of a puncture's width [m]: the needle's (`needle.BODY_RADIUS`)."""
 HALO = 1.9
-"""Size of the reddened skin about a wound, in the wound's."""
+"""Size of the reddened skin around a wound, in multiples of the wound's."""
 RAGGED = (1.0, 0.86, 1.1, 0.9, 1.15, 0.95, 0.84, 1.08, 0.92, 1.12, 0.88, 1.04)
-"""A wound's rim, from its middle, in its size."""
+"""Distances of a wound's rim from its middle, in multiples of its size."""
 PARKED = (ORIGIN[0], ORIGIN[1], SURFACE - 0.02)
-"""Where wounds that are not there are hidden, inside of the phantom [m]."""
+"""Where unused wounds are hidden, inside the phantom [m]."""
 
 
 class Marks:
@@ -62,7 +62,7 @@ class Marks:
         return np.concatenate([one + points * index for index in range(4 * pairs)])
 
     def draw(self, pair: int, pulls: tuple[Pull, ...], *, chosen: bool) -> tuple[Array, Array]:
-        """Return points and normals, (n, 3) each, where `pair` is the index of that to be sewn."""
+        """Return points and normals, (n, 3) each; `pair` is the index of the one to be sewn."""
         shown = [pair] if chosen else [index for index in range(len(self._pairs)) if index != pair]
         points = np.concatenate([self._points[chosen][index] for index in shown])
         return _lifted(points, pulls), np.concatenate([self._normals[index] for index in shown])
@@ -94,15 +94,15 @@ class Wounds:
     def draw(
         self, wounds: tuple[Wound, ...], pulls: tuple[Pull, ...], *, halo: bool
     ) -> tuple[Array, Array]:
-        """Return points and normals, (n, 3) each, of the wounds or of the halos about them.
+        """Return points and normals, (n, 3) each, of the wounds or of the halos around them.
 
-        The latest `WOUNDS` are shown; those not there are hidden.
+        The latest `WOUNDS` are shown; unused ones are hidden.
         """
         points, normals = self._whole(wounds[-WOUNDS:], halo)
         return _lifted(points, pulls), normals
 
     def _whole(self, wounds: tuple[Wound, ...], halo: bool) -> tuple[Array, Array]:
-        """Return points and normals on whole skin; those of the last wounds are kept."""
+        """Return points and normals on undeformed skin; those of the last wounds are cached."""
         if self._kept[halo][0] == wounds:
             return self._kept[halo][1]
         size = HALO if halo else 1.0
@@ -145,8 +145,8 @@ def _rim(size: float, length: float) -> Array:
     """Return a wound's middle and rim in its plane, (n, 2) [m]: across and along.
 
     Args:
-        size: times that of a wound.
-        length: half of the way it is torn along [m].
+        size: as a multiple of a wound's.
+        length: half of the distance along which it is torn [m].
     """
     angles = np.arange(len(RAGGED)) * (2 * math.pi / len(RAGGED))
     rim = np.array(RAGGED) if size == 1.0 else np.ones(len(RAGGED))
@@ -156,7 +156,7 @@ def _rim(size: float, length: float) -> Array:
 
 
 def _decal(hole: Hole, wound: Wound, size: float, lift: float) -> Array:
-    """Return the points of one wound on whole skin, (n, 3)."""
+    """Return the points of one wound on undeformed skin, (n, 3)."""
     start = np.array(hole.local(wound.start)[:2])
     end = np.array(hole.local(wound.end)[:2])
     half = (end - start) / 2

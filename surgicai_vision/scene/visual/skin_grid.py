@@ -1,8 +1,8 @@
-"""Skin grid: the closed skin of soft tissue, as a grid of points that keeps its size.
+"""Skin grid: the closed skin of soft tissue, as a grid with a fixed number of points.
 
 The grid runs over two coordinates: y along the wound, and a running number across. Between the few
-lines that its form needs, the skin is flat. More lines gather about pulls, so that a dent is smooth
-wherever it is.
+lines that its form needs, the skin is flat. More lines gather around pulls, so that a dent is
+smooth wherever it is.
 """
 
 import itertools
@@ -31,16 +31,16 @@ ROUND = 3
 OVER = 5
 """Points over the crest."""
 FLAT_ROWS = 5
-"""Rows of points before and behind the ridge."""
+"""Rows of points in front of and behind the ridge."""
 FINE = (-2.0, -1.3, -0.8, -0.45, -0.15, 0.15, 0.45, 0.8, 1.3, 2.0)
-"""Lines about a pull, in its reaches."""
+"""Offsets of the lines around a pull, in multiples of its reach."""
 FOCI = 2
-"""Pulls that get lines of their own across the skin; those along it are the largest one's. Entry
-and exit of a stitch share them."""
+"""How many pulls get their own lines across the skin; the lines along it are those of the largest
+pull. Entry and exit of a stitch share them."""
 
 
 class SkinGrid:
-    """The grid of one layout; `gather` lays its lines, then `points` and `coordinates` are theirs.
+    """The grid of one layout; `gather` lays its lines and sets their `points` and `coordinates`.
 
     Args:
         pairs: the layout's hole pairs.
@@ -55,7 +55,7 @@ class SkinGrid:
         self._places: tuple[tuple[Point, float], ...] = ()
 
     def gather(self, pulls: list[Pull]) -> None:
-        """Lay the fine lines about pulls, the largest first, at least `FOCI` of them."""
+        """Lay the fine lines around `pulls`: at least `FOCI` of them, the largest first."""
         places = tuple((pull.place, pull.reach) for pull in pulls[:FOCI])
         if places == self._places:
             return
@@ -79,7 +79,7 @@ class SkinGrid:
         return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
     def normals(self, points: Array) -> Array:
-        """Return unit normals (n, 3): of the four quads about a point, by their area."""
+        """Return unit normals (n, 3): the area-weighted mean of the four quads around a point."""
         grid = points.reshape(len(self._y), len(self._u), 3)
         quads = np.cross(grid[1:, 1:] - grid[:-1, :-1], grid[:-1, 1:] - grid[1:, :-1])
         total = np.zeros_like(grid)
@@ -88,7 +88,7 @@ class SkinGrid:
         return unit(total.reshape(-1, 3))
 
     def _nearby(self, place: Point, offsets: Array) -> Array:
-        """Return the running numbers of points at distances across from a place."""
+        """Return the running numbers of points at given distances across from a place."""
         section = self._interpolated_section(place[1])
         steps = np.diff(section, axis=0)
         offset = np.array([place[0], place[2]]) - section[:-1]
@@ -116,7 +116,7 @@ class SkinGrid:
         return np.stack([x, y, z], axis=2)
 
     def _interpolated(self, values: Array) -> Array:
-        """Return values on the form's lines (rows, columns) on all lines."""
+        """Return values given on the form's lines (rows, columns), interpolated to all lines."""
         first = np.minimum(self._u.astype(np.int64), values.shape[1] - 2)
         share = self._u - first
         wide = values[:, first] * (1 - share) + values[:, first + 1] * share
@@ -130,7 +130,7 @@ class SkinGrid:
 
 
 def _form(pairs: tuple[HolePair, ...]) -> tuple[Array, Array]:
-    """Return the rows' y, falling, (rows,) and their sections, (rows, columns, 2): x and z [m]."""
+    """Return the rows' y, descending, (rows,) and sections, (rows, columns, 2): x and z [m]."""
     sections = [_section(pair) for pair in pairs]
     edges = piece_edges(pairs)
     ends = (ORIGIN[1] + SIZE[1] / 2, ORIGIN[1] - SIZE[1] / 2)
@@ -165,7 +165,7 @@ def _section(pair: HolePair) -> Array:
 
 
 def unit(vectors: Array) -> Array:
-    """Return vectors of length 1, upwards where there is none."""
+    """Return the vectors scaled to length 1, or pointing upwards where they have none."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     units: Array = np.where(length > 1e-15, vectors / np.maximum(length, 1e-15), (0.0, 0.0, 1.0))
     return units

@@ -1,8 +1,8 @@
 """Skin state: what soft skin shows, as plain numbers in the phantom's frame.
 
-* pulls: places of the skin that are taken along, inwards by a needle or jaws that press, outwards
-  by a tip that lifts it from inside, sideways by a needle that is held there. The skin between
-  follows a bell of the pull's reach.
+* pulls: places of the skin that are displaced: inwards by a needle or jaws that press, outwards by
+  a tip that lifts it from inside, sideways by a needle that is held there. The skin between follows
+  a bell curve with the pull's reach.
 * wounds: dark spots where it was pierced, longer where it tore. They stay.
 * which pair is to be sewn: its marks are larger and darker.
 """
@@ -23,12 +23,12 @@ LEAST = 1e-4
 
 @dataclass(frozen=True)
 class Pull:
-    """A place of the skin that is taken along.
+    """A place of the skin that is displaced.
 
     Attributes:
         place: on the undeformed skin [m].
-        way: from there [m].
-        reach: of the bell about it [m]: at this distance the skin follows by 1 / e.
+        way: displacement from there [m].
+        reach: of the bell around it [m]: at this distance the skin follows by 1 / e.
     """
 
     place: Point
@@ -54,10 +54,10 @@ class SkinState:
 
 
 def displaced(points: Array, pulls: tuple[Pull, ...]) -> Array:
-    """Return points where the pulls take them.
+    """Return points displaced by the pulls.
 
-    One pull takes its place all the way; of several near each other the stronger prevails: each
-    counts by its weight w, and the sum of w² × way is divided by that of w.
+    A single pull moves its place all the way. Of several near each other the stronger prevails:
+    each has a weight w, and the sum of w² × way is divided by the sum of w.
     """
     if not pulls:
         return points

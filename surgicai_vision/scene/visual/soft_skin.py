@@ -1,8 +1,8 @@
 """Soft skin: the visible skin of tissue that can be pierced; it follows what is done to it.
 
-`add_soft_skin` adds closed skin with marks of ink in place of openings. `SoftSkin.shape` then
-writes a `SkinState` into the meshes of a model of one's own; a `FrameRenderer` uploads them when
-they have changed.
+`add_soft_skin` adds closed skin with marks of ink instead of openings. `SoftSkin.shape` then writes
+a `SkinState` into the meshes of the caller's own model; a `FrameRenderer` uploads them when they
+have changed.
 """
 
 import math
@@ -28,7 +28,7 @@ MATERIALS = {
 }
 """Mesh that `SoftSkin.shape` writes → its material."""
 RESTING = 0.001
-"""Reach of the lines about the marks while nothing touches the skin [m]."""
+"""Reach of the lines around the marks while nothing touches the skin [m]."""
 
 
 def add_soft_skin(spec: mujoco.MjSpec, body: mujoco.MjsBody, layout: str) -> None:
@@ -52,7 +52,7 @@ class SoftSkin:
     """Writes what the skin shows into a model.
 
     Args:
-        model: a model of one's own, of a scene with soft tissue.
+        model: the caller's own model of a scene with soft tissue.
         layout: the phantom's layout.
     """
 
@@ -71,7 +71,7 @@ class SoftSkin:
         return tuple(self._versions)
 
     def shape(self, state: SkinState) -> None:
-        """Write the meshes of a state, but those that are there already."""
+        """Write the meshes of a state, except those that are there already."""
         if state == self._state:
             return
         meshes = self._drawing.meshes(state)
@@ -133,7 +133,7 @@ class _Drawing:
 
 
 def _apart(pulls: list[Pull]) -> list[Pull]:
-    """Return pulls without those near an earlier one."""
+    """Return the pulls without those near an earlier one."""
     kept: list[Pull] = []
     for pull in pulls:
         if all(math.dist(pull.place, other.place) > other.reach for other in kept):

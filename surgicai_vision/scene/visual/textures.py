@@ -1,7 +1,7 @@
 """Textures: tissue and cloth, drawn from numbers alone, the same bytes on every machine.
 
-Noise uses seeded integers and additions and products of floats only, which IEEE fixes to the last
-bit; a sine or an exponential differs between processors, and with it the scene's hash. The textures
+Noise uses only seeded integers and sums and products of floats, which IEEE fixes to the last bit; a
+sine or an exponential would differ between processors, and so would the scene's hash. The textures
 reach MuJoCo as PNG files in memory, named by their content, so that the hash over the scene's XML
 covers them.
 """

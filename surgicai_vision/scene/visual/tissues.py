@@ -1,9 +1,9 @@
-"""Tissues: one texture a pattern, drawn from a generator.
+"""Tissues: one texture per pattern, drawn from a generator.
 
-A pattern is a function of (rng, size) that returns an image (height, width, 3) uint8. What varies
-within one is drawn from the generator first to last, so a seed gives the same bytes everywhere
-(`scene.visual.fields`). Widths and lengths in pixels are those of `TISSUE_SIZE`, 0.22 mm a pixel.
-The glints are highlights of small relief that is not in the mesh; they stay where they are when the
+A pattern is a function of (rng, size) that returns an image (height, width, 3) uint8. Everything
+that varies within one is drawn from the generator, so a seed gives the same bytes everywhere
+(`scene.visual.fields`). Widths and lengths in pixels are for `TISSUE_SIZE`, 0.22 mm per pixel. The
+glints are highlights of small relief that is not in the mesh; they stay where they are when the
 camera moves.
 """
 
@@ -145,7 +145,7 @@ def bowel(rng: np.random.Generator, size: Size = TISSUE_SIZE) -> Image:
 
 
 def scar(rng: np.random.Generator, size: Size = TISSUE_SIZE) -> Image:
-    """Draw a scarred field: white plates and strands on inflamed red, with cautery's dark spots."""
+    """Draw a scarred field: white plates and strands on inflamed red, and dark spots of cautery."""
     base = mixed(rng, (188.0, 92.0, 88.0), (170.0, 84.0, 96.0))
     white = mixed(rng, (232.0, 216.0, 200.0), (220.0, 206.0, 204.0))
     image = shaded(fractal(rng, size, 8, 4, 4), darker(base, 0.70), darker(base, 1.20))

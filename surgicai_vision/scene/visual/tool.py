@@ -1,7 +1,8 @@
 """Tool: the visible shape of an instrument's shaft, wrist and fingers over its physics.
 
-One mesh a link, because every geom costs each physics step a little, collides or not. Dimensions
-are those of an 8 mm needle driver, drawn slim at the wrist so that it hides little of the needle.
+One mesh per link, because every geom costs a little of each physics step, whether or not it
+collides. Dimensions are those of an 8 mm needle driver, drawn slim at the wrist so that it hides
+little of the needle.
 """
 
 import math

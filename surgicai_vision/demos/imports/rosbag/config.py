@@ -1,11 +1,11 @@
 """BagConfig: how a bag is read.
 
-It says where the poses are, in which frames and units, and how a recording becomes episodes. Two
-conventions set what is not given. Sources: `dvrk` is the da Vinci Research Kit's CRTK
-interface; its needle drivers' tip frame is on the wrist's yaw axis and oriented like ours
-(`tooltip-offset` of its tool files 400006 and 420006), and its jaw is the angle between the
-fingers, twice ours. `ambf` is the CRTK interface of the surgical robotics challenge: the same tip,
-one finger's angle as the jaw, of which only the command is published.
+It says where the poses are, in which frames and units, and how a recording becomes episodes. One of
+two conventions sets what is not given. `dvrk` is the da Vinci Research Kit's CRTK interface: its
+needle drivers' tip frame is on the wrist's yaw axis and oriented like ours (source:
+`tooltip-offset` of its tool files 400006 and 420006), and its jaw is the angle between the fingers,
+twice ours. `ambf` is the CRTK interface of the surgical robotics challenge: it has the same tip,
+and its jaw is one finger's angle, of which only the command is published.
 """
 
 import dataclasses
@@ -22,10 +22,10 @@ from surgicai_vision.core.errors import InputError, check_name
 
 METADATA = "metadata.yaml"
 ENDINGS = (".bag", ".db3", ".mcap")
-"""What makes a folder a bag of ROS 2, and a file one of ROS 1 or 2."""
+"""What marks a folder as a bag of ROS 2, and a file as one of ROS 1 or 2."""
 
 NOTHING = "none"
-"""The label of what belongs to no subtask."""
+"""The label of samples that belong to no subtask."""
 SEGMENTATIONS = ("auto", "labels", "events", NOTHING)
 CLOCKS = ("auto", "stamp", "bag")
 LABELS: Mapping[str, str] = MappingProxyType(
@@ -40,7 +40,7 @@ LABELS: Mapping[str, str] = MappingProxyType(
         "-1": NOTHING,
     }
 )
-"""Label, in lower case → subtask. Besides our names and indices those of SurgicAI."""
+"""Label, in lower case → subtask: our names and indices, and SurgicAI's names."""
 
 
 def printable(text: object, max_length: int = 80) -> str:
@@ -50,7 +50,7 @@ def printable(text: object, max_length: int = 80) -> str:
 
 
 def topic_list(topics: Collection[str], wanted: str, max_length: int = 450) -> str:
-    """Return topics as one line of limited length, those like the wanted one first."""
+    """Return topics as one line of limited length, those most similar to the wanted one first."""
     shown: list[str] = []
     length = 0
 
@@ -71,7 +71,7 @@ def is_bag(path: Path) -> bool:
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Return the bag at `path`, or the bags in the folder `path` by name."""
+    """Return the bag at `path`, or the bags in the folder `path` sorted by name."""
     if is_bag(path) or not path.is_dir():
         return [path] if is_bag(path) else []
     return sorted(child for child in path.iterdir() if is_bag(child))
@@ -79,11 +79,11 @@ def bags_in(path: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Topics:
-    """Role → topic; None takes the convention's.
+    """Role → topic; None uses the convention's.
 
     Attributes:
         psm1_pose, psm2_pose: tip pose in the arm's base.
-        psm1_joints, psm2_joints: its six joints, used where there is no pose.
+        psm1_joints, psm2_joints: the arm's six joints, used where there is no pose.
         psm1_jaw, psm2_jaw: jaw angle.
         needle: pose of the needle in world.
         label: which subtask is under way.
@@ -119,7 +119,7 @@ class Convention:
 
     Attributes:
         topics: role → topic.
-        jaw_scale: one finger's angle over the recorded jaw angle.
+        jaw_scale: one finger's angle divided by the recorded jaw angle.
     """
 
     topics: Mapping[str, str]
@@ -143,14 +143,14 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Frames:
-    """Where the recording's frames are, each x y z [m] and a quaternion w x y z; () means as ours.
+    """Where the recording's frames are, each x y z [m] and a quaternion w x y z; () means ours.
 
     Attributes:
         psm1, psm2: T_base_frame, the frame of the arm's poses in the arm's base.
         tip: T_tip_recorded, the recorded tip frame in ours.
         needle: T_world_frame, the frame of the needle's poses in world.
-        needle_offset: T_needle_recorded, the recorded needle frame in ours (the arc's centre, base
-            at -x, +z normal).
+        needle_offset: T_needle_recorded, the recorded needle frame in ours (origin at the arc's
+            centre, base at -x, +z normal).
     """
 
     psm1: tuple[float, ...] = ()
@@ -182,19 +182,19 @@ class BagConfig:
         convention: a key of `CONVENTIONS`.
         topics: topics that differ from the convention's.
         frames: frames that differ from ours.
-        jaw_scale: one finger's angle over the recorded one; None takes the convention's.
-        length_scale: metres in the recording's unit of length, of the arms' poses and of joint
+        jaw_scale: one finger's angle divided by the recorded one; None uses the convention's.
+        length_scale: metres per unit of length of the recording, for the arms' poses and joint
             insertions.
-        needle_scale: the same of the needle's poses; None: 0.1 of AMBF's own states, whose scenes
-            are ten times as large, or else 1.
+        needle_scale: the same for the needle's poses; None: 0.1 for AMBF's own states, whose scenes
+            are ten times as large, otherwise 1.
         segmentation: "labels", "events" (contact and holes; needs the needle), "none" (the whole
             recording is one episode), or "auto": the first of these that the recording allows.
         labels: further labels → subtask, or "none".
-        clock: "stamp" (headers), "bag" (when received), or "auto": stamps where there are any.
+        clock: "stamp" (headers), "bag" (time of reception), or "auto": stamps where there are any.
         max_gap: longest time between two messages that is bridged [s].
         speed: how much faster than recorded the motion becomes.
         drop_pauses: leave out samples in which the active arm rests (below 0.2 mm/s and 0.1 °/s).
-        step: step preset; None takes the smallest that is fast enough.
+        step: step preset; None uses the smallest that is fast enough.
     """
 
     convention: str = "dvrk"
@@ -231,16 +231,16 @@ class BagConfig:
 
     @property
     def all_topics(self) -> dict[str, str]:
-        """Return role → topic, given or the convention's."""
+        """Return role → topic, as given or else the convention's."""
         return {**CONVENTIONS[self.convention].topics, **self.topics.given()}
 
     @property
     def jaw(self) -> float:
-        """Return one finger's angle over the recorded jaw angle."""
+        """Return one finger's angle divided by the recorded jaw angle."""
         return CONVENTIONS[self.convention].jaw_scale if self.jaw_scale is None else self.jaw_scale
 
     def subtask_of(self, label: str) -> str:
-        """Return the subtask a label means, or "none".
+        """Return the subtask that a label means, or "none".
 
         Raises:
             InputError: an unknown label.

@@ -4,9 +4,9 @@
 
 A bag is read (`sandbox`, `reader`), resampled to the control rate (`resample`), split into subtasks
 (`segments`), freed of pauses (`tracks`), replayed (`replay`) and written. Arms and needle are posed
-where they were measured; actions are the motions between. Success is judged as in the envs, with
-one exception: contact may also be that of the geometry (`segments.held`), because a recorded needle
-is never between our pads to a tenth of a millimetre.
+where they were measured; actions are the motions in between. Success is judged as in the envs, with
+one exception: geometric contact (`segments.held`) also counts, because a recorded needle never lies
+between our pads to within a tenth of a millimetre.
 
 A needle that is not in the bag is where the task's definition puts it, as in SurgicAI's recordings
 (`replay`).
@@ -43,12 +43,12 @@ from surgicai_vision.envs import SUBTASKS
 
 Row = Mapping[str, JSON]
 DEMONSTRATOR = "bag"
-"""Who demonstrates in a bag, as it is stored."""
+"""The demonstrator's name for a bag, as it is stored."""
 
 
 @dataclass(frozen=True)
 class BagSummary:
-    """What an import made of one subtask.
+    """The result of an import for one subtask.
 
     Attributes:
         task: the subtask.
@@ -59,8 +59,8 @@ class BagSummary:
         clipped: steps faster than the preset allows, whose action was clipped to [-1, 1].
         pauses: samples left out because the arm rested.
         succeeded: demonstrations whose last state meets the task's tolerances in our scene.
-        skipped: segments that could not be replayed, and recordings that show nothing of what is
-            wanted, {"bag", "task", "from", "to", "reason"}; times in seconds.
+        skipped: segments that could not be replayed, and recordings that show nothing of what was
+            requested, {"bag", "task", "from", "to", "reason"}; times in seconds.
     """
 
     task: str
@@ -83,22 +83,22 @@ def import_bags(
     env: Mapping[str, object] | None = None,
     progress: Progress | None = None,
 ) -> list[BagSummary]:
-    """Import bags into folders of demonstrations, one a subtask.
+    """Import bags into folders of demonstrations, one per subtask.
 
     Args:
         bags: bag files and ROS 2 folders.
-        task: the subtask that is wanted, into `out`; None: every one that is found, into
-            `out`/<task>.
-        out: folder to make; the same import of the same bags finds it finished.
-        config: how to read them.
-        env: fields of `TaskConfig`, among them the scene with its hole pair and instrument.
+        task: the requested subtask, written to `out`; None: every subtask that is found, written
+            to `out`/<task>.
+        out: folder to create; repeating the same import of the same bags reuses it.
+        config: how to read the bags.
+        env: fields of `TaskConfig`, including the scene with its hole pair and instrument.
         progress: called with (bags read, bags, "bags"), then (demonstrations done, demonstrations,
             "demonstrations").
 
     Raises:
         UnknownName: an unknown task.
         BadFile: an unreadable bag.
-        InputError: topics that are not there, nothing to segment by, nothing found in any of them,
+        InputError: topics that are not there, nothing to segment by, nothing found in any bag,
             nothing that can be replayed.
         OutputExists: `out` holds something else.
     """
@@ -122,21 +122,21 @@ def import_bags(
 
 
 def base_config(task: str | None, env: Mapping[str, object] | None) -> TaskConfig:
-    """Return the env of an import: of a subtask that is wanted, or of any."""
+    """Return the env of an import: that of the requested subtask, or of any."""
     return from_mapping(
         TaskConfig, {**(env or {}), "task": check_name("subtask", task or "grasp", names.SUBTASKS)}
     )
 
 
 def check_folders(out: Path, task: str | None) -> None:
-    """Refuse, before anything is read, folders that an import cannot write.
+    """Refuse folders that an import cannot write, before anything is read.
 
     Args:
         out: as given to the import.
-        task: the subtask that is wanted, into `out`; None: any, into `out`/<task>.
+        task: the requested subtask, written to `out`; None: any, written to `out`/<task>.
 
     Raises:
-        OutputExists: one holds something else than demonstrations.
+        OutputExists: one holds something other than demonstrations.
         InputError: one cannot be written.
     """
     for folder in [out] if task else [out / name for name in names.SUBTASKS]:
@@ -154,18 +154,18 @@ def write_tracks(
     report: Progress,
     demonstrator: str = DEMONSTRATOR,
 ) -> list[BagSummary]:
-    """Replay tracks into folders of demonstrations, one a subtask.
+    """Replay tracks into folders of demonstrations, one per subtask.
 
     Args:
         tracks: what was found.
         skipped: what was found and cannot be used.
-        task: the subtask that is wanted, into `out`; None: all, into `out`/<task>.
-        out: folder to make.
+        task: the requested subtask, written to `out`; None: all, written to `out`/<task>.
+        out: folder to create.
         base: the env (`base_config`).
         config: how the recording was read.
-        request: what was asked for; the same request finds its folders finished.
-        report: counts demonstrations.
-        demonstrator: who demonstrates, as it is stored.
+        request: what was requested; repeating the same request reuses its folders.
+        report: gets the number of demonstrations done.
+        demonstrator: the demonstrator's name, as it is stored.
 
     Raises:
         InputError: nothing can be replayed.
@@ -174,7 +174,7 @@ def write_tracks(
         first = skipped[0]
         what = f"{first['bag']}: {first['task']}" if first["task"] else first["bag"]
         raise InputError(f"Nothing can be imported: {what}: {first['reason']}.")
-    # Make a folder for each subtask that was found, or find it finished.
+    # Create a folder for each subtask that was found, or reuse a finished one.
     summaries = []
     done = 0
     for name in names.SUBTASKS:
@@ -209,7 +209,7 @@ def _digests(bag: Path) -> dict[str, str]:
 
 
 def _report_all(progress: Progress, before: int, total: int, done: int) -> None:
-    """Report the progress of one subtask as that of all."""
+    """Report the progress of one subtask as progress of the whole import."""
     progress(before + done, total, "demonstrations")
 
 

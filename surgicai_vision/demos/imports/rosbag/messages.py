@@ -2,8 +2,8 @@
 
 `rosbags` would turn a bag's message definitions into Python code and run it. Here a definition is
 data: a table of fields that a cursor follows. The tables below are the published ones
-(common_interfaces, ambf_msgs); only for AMBF's own types, which changed between its versions, is
-the bag's definition read, and it may name only the types in these tables.
+(common_interfaces, ambf_msgs). The bag's own definition is read only for AMBF's types, which
+changed between its versions, and may name only the types in these tables.
 
     layout = layout_of("geometry_msgs/PoseStamped", ros1=True)
     decode(data, layout, ros1=True)["pose.position.x"]
@@ -86,13 +86,13 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
         ),
     }
 )
-"""Message type → its fields, one "type name" a line; `_flatten` adds the counter that headers of
-ROS 1 have before the stamp."""
+"""Message type → its fields, one "type name" per line; `_flatten` adds the counter that ROS 1
+headers have before the stamp."""
 AMBF = ("ambf_msgs/RigidBodyState", "ambf_msgs/ObjectState")
 MAX_FIELDS = 200
-"""Fields of a definition that are read, at most."""
+"""Most fields of a definition; one with more is refused."""
 MAX_TEXT = 20_000
-"""Characters of a definition that are read, at most."""
+"""Most characters of a definition; a longer one is refused."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ class Field:
     """One field of a message: a number, a text, or a sequence of them.
 
     Attributes:
-        name: its name, nested ones with dots.
+        name: its name, with dots for nested fields.
         kind: a key of `PRIMITIVES`, or "string".
-        many: it is a sequence.
+        many: whether it is a sequence.
     """
 
     name: str
@@ -118,12 +118,11 @@ def layout_of(kind: str, *, ros1: bool, text: str = "") -> Layout:
 
     Args:
         kind: a key of `DEFINITIONS`.
-        ros1: serialised by ROS 1.
-        text: the definition in the bag; read for AMBF's types alone.
+        ros1: whether the messages were serialised by ROS 1.
+        text: the definition in the bag; only read for AMBF's types.
 
     Raises:
-        BadFile: an unknown type, or a definition of AMBF's with fields that are not among the known
-            types.
+        BadFile: an unknown type, or a definition of an AMBF type with fields of unknown types.
     """
     if kind not in DEFINITIONS:
         raise BadFile(
@@ -178,16 +177,16 @@ def _lines(text: str) -> list[tuple[str, str]]:
 
 
 Message = Mapping[str, Any]
-"""Field → its value: a number, a text, or a tuple of them, as the bag's definition has it."""
+"""Field → its value: a number, a text, or a tuple of them, according to the bag's definition."""
 
 
 def decode(data: bytes | memoryview, layout: Layout, *, ros1: bool) -> Message:
-    """Return a message's fields by name, nested ones with dots.
+    """Return a message's fields by name, with dots for nested ones.
 
     Args:
-        data: serialised; of ROS 2 with CDR's four bytes of encapsulation.
+        data: the serialised message, for ROS 2 including CDR's four bytes of encapsulation.
         layout: its fields.
-        ros1: serialised by ROS 1, which does not align.
+        ros1: whether it was serialised by ROS 1, which does not align.
 
     Raises:
         ValueError: bytes that do not fit the layout: too few, too many, a length beyond the end.
@@ -199,7 +198,7 @@ def decode(data: bytes | memoryview, layout: Layout, *, ros1: bool) -> Message:
 
 
 class _Cursor:
-    """Reads a message's fields one after the other."""
+    """Reads a message's fields one after another."""
 
     def __init__(self, data: bytes, ros1: bool):
         self._data = data
@@ -229,7 +228,7 @@ class _Cursor:
         return self._numbers(PRIMITIVES[field.kind], count) if count else ()
 
     def finish(self) -> None:
-        """Raise ValueError for bytes that are left over, other than CDR's padding."""
+        """Raise ValueError for leftover bytes other than CDR's padding."""
         left = len(self._data) - self._offset
         if left > (3 if self._aligned else 0):
             raise ValueError(f"{left} bytes too many")

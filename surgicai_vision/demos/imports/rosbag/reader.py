@@ -1,16 +1,16 @@
-"""Reader: bags of ROS 1 and ROS 2 as arrays, before they are checked for sense.
+"""Reader: bags of ROS 1 and ROS 2 as arrays, before any plausibility check.
 
     arrays = read(Path("trial.bag"), {"psm2_pose": "/PSM2/measured_cp"})
 
 The library `rosbags` opens the containers: `.bag`, a ROS 2 folder (`metadata.yaml` with sqlite3 or
-mcap storage), a single `.db3` or `.mcap`. Messages are decoded by `messages`, never by code made
-from the bag's own definitions. It runs in the process of `sandbox`.
+mcap storage), a single `.db3` or `.mcap`. Messages are decoded by `messages`, never by code
+generated from the bag's own definitions. The reader runs in the child process of `sandbox`.
 
-The result holds `topics`, all topics of the bag, and for each role whose topic is there, of N
-messages in the order of the bag: `<role>.time` of reception and `<role>.stamp` of the header (0
-where there is none), both (N,) int64 [ns]; `<role>.value`; `<role>.type` and `<role>.frame`, one
-text each. Values: poses (N, 7), x y z in the recording's unit and a unit quaternion w x y z; joints
-(N, 6); jaw (N,); label (N,) texts.
+The result holds `topics`, all topics of the bag. For each role whose topic is there, it also holds
+the topic's N messages in the order of the bag: the time of reception `<role>.time` and the header's
+stamp `<role>.stamp` (0 where there is none), both (N,) int64 [ns]; `<role>.value`; `<role>.type`
+and `<role>.frame`, one text each. Values: poses (N, 7), x y z in the recording's unit and a unit
+quaternion w x y z; joints (N, 6); jaw (N,); label (N,) texts.
 """
 
 import bz2
@@ -64,7 +64,7 @@ KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "label": ("std_msgs/String", *INTEGER_MESSAGES),
     }
 )
-"""Last word of a role → the message types that it is read from."""
+"""Last word of a role → the message types it can be read from."""
 ROLES = (
     "psm1_pose",
     "psm1_jaw",
@@ -77,19 +77,19 @@ ROLES = (
 )
 
 MAX_MESSAGES = 5_000_000
-"""Messages of all roles, at most."""
+"""Most messages of all roles together."""
 MAX_MESSAGE = 2**20
-"""Size of a message, at most [byte]."""
+"""Largest size of a message [byte]."""
 MAX_CHUNK = 2**26
-"""Size of an unpacked chunk, at most [byte]; ROS packs 768 KB, and more where there are images."""
+"""Largest size of an unpacked chunk [byte]; ROS packs 768 KB, and more where there are images."""
 MAX_METADATA = 2**18
-"""Size of the text that describes a ROS 2 folder, at most [byte]."""
+"""Largest size of the text that describes a ROS 2 folder [byte]."""
 MAX_DEPTH = 20
-"""Nesting of brackets in that text, at most."""
+"""Deepest nesting of brackets in that text."""
 MAX_LISTED = 1000
-"""Topics of a bag that a message may name."""
+"""Most topics of a bag that an error message may name."""
 UNIT_TOLERANCE = 0.01
-"""Furthest a quaternion's length may be from 1."""
+"""Largest deviation of a quaternion's length from 1."""
 _POSE_FIELDS = (
     ("pose.position", "pose.orientation"),
     ("position", "orientation"),
@@ -109,9 +109,9 @@ def read(
         needed: roles whose topic must be there; the others may be missing.
 
     Raises:
-        InputError: a needed topic is not there, or of a type that cannot be its role's; names what
-            there is.
-        BadFile: missing, damaged, malicious, or with numbers that are not finite.
+        InputError: a needed topic is not there, or its type does not fit its role; the message
+            names what there is.
+        BadFile: a bag that is missing, damaged, malicious, or has numbers that are not finite.
     """
     try:
         _inspect(path)
@@ -140,7 +140,7 @@ def _read(
             f"{path} has no topic {wanted_topic} ({missing[0]}); "
             f"it has {topic_list(known, wanted_topic)}."
         )
-    # Check the types of the topics that are there, before a message is read.
+    # Check the types of the topics that are there before any message is read.
     wanted = [
         connection for connection in reader.connections if connection.topic in topics.values()
     ]
@@ -200,12 +200,12 @@ def _check_kind(connection: Connection, topics: Mapping[str, str]) -> None:
 
 
 class _Column:
-    """The messages of one role's topic, kept as numbers: there are hundreds of thousands.
+    """The messages of one role's topic, stored as numbers: there are hundreds of thousands.
 
     Args:
         role: one of `ROLES`.
         topic: its topic.
-        path: the bag, for messages.
+        path: the bag, for error messages.
     """
 
     def __init__(self, role: str, topic: str, path: Path):
@@ -286,7 +286,7 @@ def _joints(message: Message) -> list[float]:
 def _jaw(message: Message) -> list[float]:
     if "data" in message:
         return [float(message["data"])]
-    # AMBF's state of a PSM has its two fingers behind the six joints.
+    # AMBF's state of a PSM has its two fingers after the six joints.
     return [
         float(message["position"][0] if "position" in message else message["joint_positions"][6])
     ]
@@ -312,7 +312,7 @@ def _plain(kind: str) -> str:
 
 
 def _inspect(path: Path) -> None:
-    """Refuse what is no bag, and what `rosbags` would trust too far."""
+    """Refuse a path that is not a bag, and content that `rosbags` would trust too much."""
     if not path.exists():
         raise BadFile(f"Cannot read {path}: no such file.")
     if not is_bag(path):
@@ -330,7 +330,7 @@ def _inspect(path: Path) -> None:
 
 
 def _inspect_metadata(path: Path) -> None:
-    """Check a folder's description before `rosbags` parses it: deep brackets take YAML seconds."""
+    """Check a folder's description before `rosbags` parses it: YAML is slow on deep brackets."""
     size = path.stat().st_size
     if size > MAX_METADATA:
         raise BadFile(f"{path} has {size} bytes; above {MAX_METADATA} are not read.")
@@ -365,7 +365,7 @@ def _inspect_database(path: Path) -> None:
 
 
 def _bounded(whole: bytes) -> bytes:
-    """Return an unpacked chunk that is not too large."""
+    """Return an unpacked chunk, or refuse it if it is too large."""
     if len(whole) > MAX_CHUNK:
         raise BadFile(f"a chunk unpacks to more than {MAX_CHUNK >> 20} MB; it is not read.")
     return whole
@@ -384,7 +384,7 @@ def _zstd(data: bytes) -> bytes:
 
 
 class _Zstd:
-    """What `rosbags` uses of zstd for single messages."""
+    """The part of zstd that `rosbags` uses for single messages."""
 
     decompress = staticmethod(_zstd)
 

@@ -3,10 +3,10 @@
     arrays = read_sandboxed(path, "bag", topics=config.all_topics)
     recording = resample(arrays, config, instrument)
 
-Each topic has its own times, with jitter and lost messages. Times are those of the headers where
-there are headers (shifted by the median delay, so that they agree with topics that have none), or
-else those of reception. Positions, joints and jaws are interpolated linearly between the two
-messages around a sample, rotations by slerp; labels and commands (a jaw from `servo_jp`) hold until
+Each topic has its own times, with jitter and lost messages. Its times are those of the headers if
+it has headers (shifted by the median delay, so that they agree with topics without headers),
+otherwise those of reception. Positions, joints and jaws are interpolated linearly between the two
+messages around a sample, rotations by slerp. Labels and commands (a jaw from `servo_jp`) hold until
 the next message. A sample between two messages further apart than `max_gap` is not `valid`.
 """
 
@@ -28,9 +28,9 @@ RATE = float(names.FPS)
 MAX_DURATION = 3600.0
 """Longest recording that is resampled [s]."""
 AMBF_UNIT = 0.1
-"""Metres in a unit of length of the challenge's AMBF scenes (its `SimToSI`)."""
+"""Metres per unit of length of the challenge's AMBF scenes (its `SimToSI`)."""
 COMMANDS = ("servo_jp", "move_jp")
-"""Last parts of CRTK's topics that command joints."""
+"""Last parts of the CRTK topics that command joints."""
 ENDOSCOPE_FRAMES = ("ecm", "cam")
 """Parts of the names of frames that are relative to the endoscope, not an arm's base."""
 
@@ -38,7 +38,7 @@ Arrays = Mapping[str, NDArray[np.generic]]
 
 
 class NothingShown(InputError):
-    """A recording without what is wanted of it; others of the same import may have it."""
+    """A recording that does not show what is requested; others of the same import may show it."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class Recording:
         arms: arm → its motion; arms that were not recorded are missing.
         needle: T_world_needle (N, 4, 4), or None.
         label: present label, (N,) texts, "" before the first; or None.
-        valid: (N,) bool; False in a gap of any topic but labels and commands.
-        time: since the first sample, as recorded, (N,) [s].
-        topics: every topic of the bag with its type, for messages.
+        valid: (N,) bool; False in a gap of any topic except labels and commands.
+        time: recorded time since the first sample, (N,) [s].
+        topics: every topic of the bag with its type, for error messages.
     """
 
     arms: Mapping[str, Arm]
@@ -84,11 +84,11 @@ def resample(arrays: Arrays, config: BagConfig, instrument: str) -> Recording:
 
     Args:
         arrays: see `reader.read`.
-        config: how to read it.
-        instrument: the instrument whose joints these are, where there are joints and no pose.
+        config: how to read the bag.
+        instrument: the instrument that the joints belong to, where there are joints and no pose.
 
     Raises:
-        NothingShown: no time in which all topics overlap.
+        NothingShown: there is no time in which all topics overlap.
         InputError: no arm, a recording that is too long, poses in a frame that is not the arm's
             base.
     """
@@ -127,14 +127,14 @@ def resample(arrays: Arrays, config: BagConfig, instrument: str) -> Recording:
 
 
 def _is_command(role: str, config: BagConfig) -> bool:
-    """Return True if a role's topic has commands, which hold until the next one."""
+    """Return True if a role's topic carries commands, which hold until the next one."""
     return role.endswith("_jaw") and config.all_topics[role].rsplit("/", 1)[-1] in COMMANDS
 
 
 def _last[T: np.generic](
     track: tuple[NDArray[np.float64], NDArray[T]], grid: NDArray[np.float64]
 ) -> NDArray[T]:
-    """Return the last value at each sample, before the first one the first."""
+    """Return the latest value at each sample; before the first value, the first one."""
     times, values = track
     held: NDArray[T] = values[np.maximum(np.searchsorted(times, grid, side="right") - 1, 0)]
     return held
@@ -152,7 +152,7 @@ def _jaw(
 
 
 def _roles(arrays: Arrays, config: BagConfig) -> list[str]:
-    """Return the roles to interpolate: each arm's pose or else joints, its jaw, and the needle."""
+    """Return the roles to interpolate: each arm's pose, or else joints, its jaw, and the needle."""
     roles: list[str] = []
     for arm in names.ARMS:
         recorded = [
@@ -191,7 +191,7 @@ def _times(arrays: Arrays, config: BagConfig) -> dict[str, NDArray[np.int64]]:
 def _distinct[T: np.generic](
     times: NDArray[np.int64], values: NDArray[T], begin: int
 ) -> tuple[NDArray[np.float64], NDArray[T]]:
-    """Return increasing times since `begin` [ns] and their values, of a repeated time the last."""
+    """Return increasing times since `begin` [ns] and their values; of a repeated time, the last."""
     order = np.argsort(times, kind="stable")
     since = (times[order] - begin).astype(np.float64)
     last = np.append(np.diff(since) > 0, True)
@@ -210,7 +210,7 @@ def _covered(
 def resampled(
     times: NDArray[np.float64], poses: NDArray[np.float64], grid: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return poses (M, 7), x y z and quaternion w x y z, at other times as matrices (N, 4, 4)."""
+    """Return poses (M, 7), x y z and quaternion w x y z, at new times as matrices (N, 4, 4)."""
     found = np.tile(np.eye(4), (len(grid), 1, 1))
     for axis in range(3):
         found[:, axis, 3] = np.interp(grid, times, poses[:, axis])
@@ -223,7 +223,7 @@ def resampled(
 
 
 def as_matrix(pose: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return x y z [m] and a quaternion w x y z as a pose (4, 4); the identity of nothing."""
+    """Return x y z [m] and a quaternion w x y z as a pose (4, 4); the identity for ()."""
     return (
         resampled(np.zeros(1), np.array([pose], dtype=float), np.zeros(1))[0] if pose else np.eye(4)
     )

@@ -2,7 +2,7 @@
 
     for segment in segments(recording, pair, config, task=None): ...
 
-By labels: the longest runs of one subtask. By events, in the order of the procedure, over and over:
+By labels: the maximal runs of one subtask. By events, in the order of the procedure, repeatedly:
 
     grasp    until PSM2 holds the needle
     place    until the tip passes the entry
@@ -10,11 +10,11 @@ By labels: the longest runs of one subtask. By events, in the order of the proce
     handoff  until PSM1 holds the needle
     pullout  until the needle's last move in PSM1's jaws, after it has left the exit
 
-An arm holds the needle when its jaw is closed (0.2 rad, where the surgical robotics challenge
-grasps) with the needle within reach of its pads, for 0.1 s. Holes are traversed by the same test as
-in the envs (`envs.hole_crossing`). A recording that starts late starts with the subtask that is
-then under way, and a needle that is held as near to the entry as an insertion starts (5.5 mm, 12°)
-is inserted, not placed.
+An arm holds the needle when its jaw has been closed (0.2 rad, where the surgical robotics challenge
+grasps) with the needle within reach of its pads for 0.1 s. Traversed holes are detected by the same
+test as in the envs (`envs.hole_crossing`). A recording that starts late begins with the subtask
+then under way. A needle held as close to the entry as an insertion may start (5.5 mm, 12°) counts
+as being inserted, not placed.
 """
 
 import itertools
@@ -43,30 +43,30 @@ from surgicai_vision.scene.rotations import geodesic_angle
 HOLD_JAW = 0.2
 """An arm that holds the needle has its finger below this angle [rad]."""
 HOLD_REACH = 0.003
-"""An arm that holds the needle has it this near its grasp point [m]."""
+"""An arm that holds the needle has it within this distance of its grasp point [m]."""
 STILL = 0.02
 """The finger of an arm that holds the needle closes by less than this in the next 0.2 s [rad]."""
 SUSTAINED = 5
-"""Samples an event must last: 0.1 s."""
+"""Samples that an event must last: 0.1 s."""
 SHORTEST = 10
-"""Samples of the shortest segment that is taken: 0.2 s."""
+"""Samples of the shortest segment that is kept: 0.2 s."""
 ARRIVED = 0.0005
 ARRIVED_TURN = np.radians(2.0)
-"""The needle has arrived when it is this near to where PSM1 takes it [m, rad]."""
+"""The needle has arrived when it is this close to where PSM1 takes it [m, rad]."""
 PAUSE_JAW_RATE = np.radians(1.0)
-"""A jaw that is slower rests [rad/s]."""
+"""A jaw slower than this is at rest [rad/s]."""
 WINDOW = 5
-"""Speeds are taken over this many samples to either side, 0.2 s in all: less would be the sensors'
-noise.
+"""Speeds are measured over this many samples to either side, 0.2 s in all: over fewer samples, the
+sensors' noise would dominate.
 """
 DRIFT = 0.25e-3
 DRIFT_TURN = np.radians(1.0)
-"""A resting arm's sample is kept once it has crept this far from the last one kept: half a step."""
+"""A sample of a resting arm that has crept this far from the last one kept is kept: half a step."""
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Samples `start` to `stop`, the last one included, of one subtask."""
+    """Samples `start` to `stop` (inclusive) of one subtask."""
 
     task: str
     start: int
@@ -82,8 +82,8 @@ def segments(
         recording: the recording.
         pair: the holes the needle goes through.
         config: how to segment it.
-        task: the subtask that is wanted, and what a recording without labels and needle shows; None
-            for all.
+        task: the requested subtask, and what a recording without labels and needle shows; None for
+            all.
 
     Raises:
         NothingShown: nothing found.
@@ -175,7 +175,7 @@ def _by_events(recording: Recording, pair: HolePair) -> list[Segment]:
 
 
 def _next(event: NDArray[np.bool_], start: int) -> int:
-    """Return the first sample from `start` on that an event holds, or the last sample."""
+    """Return the first sample from `start` on in which an event holds, or the last sample."""
     found = np.flatnonzero(event[start:])
     return start + int(found[0]) if len(found) else len(event) - 1
 
@@ -201,14 +201,14 @@ def held(
     """
     tips = kinematics.base_in_world(arm) @ tip
     grasps = tips[:, :3, 3] + GRASP_DEPTH * tips[:, :3, 2]
-    # In the needle's frame, clamped to its arc: the distance from a point to the nearest point of
-    # the needle.
+    # Distance from each grasp point to the nearest point of the needle, in the needle's frame and
+    # clamped to its arc.
     x, y, z = np.einsum("nji,nj->in", needle_poses[:, :3, :3], grasps - needle_poses[:, :3, 3])
     angle = np.clip(np.arctan2(y, -x), 0.0, needle.TIP_ANGLE)
     distance = np.sqrt(
         (x + needle.RADIUS * np.cos(angle)) ** 2 + (y - needle.RADIUS * np.sin(angle)) ** 2 + z**2
     )
-    # A jaw that goes on closing has not closed on anything yet.
+    # A jaw that is still closing has not closed on anything yet.
     later = np.stack(
         [np.pad(jaw, (0, shift), mode="edge")[shift:] for shift in range(2 * WINDOW)]
     ).min(axis=0)
@@ -243,9 +243,9 @@ class _NeedleAlone:
 
 
 def holes_passed(needle_poses: NDArray[np.float64], pair: HolePair) -> NDArray[np.float64]:
-    """Return `TaskState.holes_passed` of each needle pose (N, 4, 4) in an episode, (N,).
+    """Return `TaskState.holes_passed` for each needle pose (N, 4, 4) in an episode, (N,).
 
-    A needle that is out and comes back to the entry begins the next stitch, with none passed.
+    A needle that is out and comes back to the entry begins the next stitch, with no holes passed.
     """
     state = TaskState()
     passed = []
@@ -265,7 +265,7 @@ def holes_passed(needle_poses: NDArray[np.float64], pair: HolePair) -> NDArray[n
 
 
 def _near_entry(pose: NDArray[np.float64], pair: HolePair) -> bool:
-    """Return True if a needle is as near to the goal of place as an insertion starts."""
+    """Return True if a needle is as close to the goal of place as an insertion may start."""
     goal = Stitch.of(pair).place()
     tip = needle_frame(needle.TIP_ANGLE)
     away = np.linalg.norm((pose @ tip - goal @ tip)[:3, 3])
@@ -293,11 +293,11 @@ def _release(holding: NDArray[np.bool_], needle_poses: NDArray[np.float64], star
 
 
 def moving(tip: NDArray[np.float64], jaw: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices of the samples outside pauses, the first and the last always among them.
+    """Return the indices of the samples outside pauses, always including the first and the last.
 
     Args:
         tip: T_base_tip (N, 4, 4) at `RATE`.
-        jaw: finger's angle (N,) [rad].
+        jaw: one finger's angle (N,) [rad].
     """
     count = len(tip)
     before = np.maximum(np.arange(count) - WINDOW, 0)

@@ -28,10 +28,11 @@ from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.rotations import matrix_to_rpy
 
 CLOSED = ("place", "insert", "pullout")
-"""Subtasks whose arm holds the needle throughout: a jaw that was not recorded is closed."""
+"""Subtasks whose arm holds the needle throughout: a jaw that was not recorded is taken as closed.
+"""
 MAX_GRIP_ERROR = 0.005
-"""Furthest an inferred needle may be outside the jaws that hold it [m]: the paper lets place and
-insert end that far from their goals."""
+"""Largest distance of an inferred needle outside the jaws that hold it [m]: the paper lets place
+and insert end that far from their goals."""
 START_JAW = kinematics.STARTS[names.PSM1].jaw
 """Jaw of an arm that does not hold the needle and whose jaw was not recorded [rad]."""
 
@@ -60,7 +61,7 @@ class SegmentTrack:
     pauses: int
 
     def row(self, reason: str) -> dict[str, JSON]:
-        """Return the entry of a segment that is skipped."""
+        """Return the row of a skipped segment."""
         return _row(self.bag, self.task, self.begin, self.end, reason)
 
 
@@ -69,13 +70,13 @@ def extract_tracks(
 ) -> tuple[list[SegmentTrack], list[dict[str, JSON]]]:
     """Return the tracks of a bag's segments, and what is skipped.
 
-    A skipped segment is {"bag", "task", "from", "to", "reason"}; so is a recording that shows
-    nothing of what is wanted, whose task is "" where all were.
+    A skipped segment is {"bag", "task", "from", "to", "reason"}. So is a recording that shows
+    nothing of what is requested; its task is "" if all were requested.
 
     Args:
         bag: the bag.
-        task: the subtask that is wanted; None for all.
-        config: how to read it.
+        task: the requested subtask; None for all.
+        config: how to read the bag.
         base: the scene.
 
     Raises:
@@ -91,13 +92,13 @@ def extract_tracks(
 def tracks_of(
     arrays: Arrays, path: Path, task: str | None, config: BagConfig, base: TaskConfig
 ) -> tuple[list[SegmentTrack], list[dict[str, JSON]]]:
-    """Return the tracks of a recording's segments, and what is skipped, as `extract_tracks`.
+    """Return the tracks of a recording's segments, and what is skipped, as `extract_tracks` does.
 
     Args:
         arrays: see `reader.read`.
-        path: what it was read from, for messages; its name is the tracks'.
-        task: the subtask that is wanted; None for all.
-        config: how to read it.
+        path: what the recording was read from, for messages; its name becomes the tracks' `bag`.
+        task: the requested subtask; None for all.
+        config: how to read the recording.
         base: the scene.
     """
     begin = 0.0
@@ -177,7 +178,7 @@ def _track(
 
 
 def _jaw(recording: Recording, arm: str, task: str, config: BagConfig) -> NDArray[np.float64]:
-    """Return an arm's jaw (N,) [rad], as recorded or as the subtask has it."""
+    """Return an arm's jaw (N,) [rad], as recorded or as implied by the subtask."""
     motion: Arm = recording.arms[arm]
     if motion.jaw is not None:
         return motion.jaw
@@ -193,7 +194,7 @@ def _jaw(recording: Recording, arm: str, task: str, config: BagConfig) -> NDArra
 
 
 def _grasp_angle(arm: str, tip: NDArray[np.float64], needle_pose: NDArray[np.float64]) -> float:
-    """Return the needle's point that is nearest to an arm's jaws, the demonstrated grasp [rad]."""
+    """Return the needle's point nearest to an arm's jaws, the demonstrated grasp [rad]."""
     x, y, _ = (np.linalg.inv(needle_pose) @ kinematics.base_in_world(arm) @ tip)[:3, 3]
     return float(np.clip(np.arctan2(y, -x), 0.0, needle.TIP_ANGLE))
 
@@ -201,7 +202,7 @@ def _grasp_angle(arm: str, tip: NDArray[np.float64], needle_pose: NDArray[np.flo
 def _inferred(
     tip: NDArray[np.float64], jaw: NDArray[np.float64], task: str, base: TaskConfig
 ) -> NDArray[np.float64]:
-    """Return T_world_needle (T + 1, 4, 4) where the task's definition puts an unseen needle."""
+    """Return T_world_needle (T + 1, 4, 4) where the task's definition puts an unrecorded needle."""
     if (base.scene.layout, base.scene.hole_pair) != ("simple", 1):
         raise InputError(
             "A bag without the needle's pose can be replayed at hole pair 1 of layout simple alone."
