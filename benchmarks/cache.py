@@ -64,7 +64,7 @@ def read(
     for chosen in order:
         total += float(rows[chosen].astype(kind, copy=False)[0, 0])
     seconds = time.perf_counter() - began
-    assert total == float(np.sum(order[:, 0] % 2048)), "another row than asked for"
+    assert total == float(np.sum(order[:, 0] % 2048)), "a different row from the one requested"
     return order.size / seconds
 
 

@@ -97,7 +97,9 @@ def ways(
     encoder = encoders.load_encoder(name, weights=encoders.WeightsSource.of(weights))
     batch = CUDA_BATCH if torch.cuda.is_available() else BATCH
     error = np.abs(loop(frames[:batch], batch).astype(np.float32) - encoder(frames[:batch])).max()
-    print(f"{name}: largest difference between the ways {error:.4f}", file=sys.stderr)
+    print(
+        f"{name}: largest difference between the two implementations {error:.4f}", file=sys.stderr
+    )
     made = {
         f"bare_{batch}": lambda: len(loop(frames, batch)),
         "bare_16": lambda: len(loop(frames, 16)),
@@ -140,7 +142,7 @@ def main() -> None:
     parser.add_argument("--encoder", help="measure only this encoder", metavar="NAME")
     parser.add_argument("--weights", help="file with the encoder's weights", metavar="FILE")
     parser.add_argument(
-        "--dataset", help="a dataset of ours whose images to encode as well", metavar="DIR"
+        "--dataset", help="a surgicai-vision dataset whose images to encode as well", metavar="DIR"
     )
     parser.add_argument("--frames", type=int, default=256)
     parser.add_argument("--repeats", type=int, default=5)

@@ -137,8 +137,8 @@ def draw(curves: dict[str, dict[str, Any]], speed: float) -> plt.Figure:
             label=preset,
         )
     _name_events(axes, next(iter(curves.values())))
-    axes.set_xlabel("way of the tip beyond the entry's mark [mm]")
-    axes.set_ylabel("force against the way [N]")
+    axes.set_xlabel("travel of the tip beyond the entry mark [mm]")
+    axes.set_ylabel("force against the motion [N]")
     axes.set_title(f"One insertion into soft tissue, {1e3 * speed:g} mm/s", fontsize=10, loc="left")
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_ylim(bottom=min(0.0, *(1.1 * min(curve["force_n"]) for curve in curves.values())))

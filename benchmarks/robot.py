@@ -140,7 +140,7 @@ def serving(command: list[str], said: Path, log: Path) -> Iterator[None]:
         ends = time.monotonic() + BEGINS_S
         while "serving" not in log.read_text():
             if server.poll() is not None or time.monotonic() > ends:
-                raise SystemExit(f"robot serve did not begin:\n{log.read_text()}")
+                raise SystemExit(f"robot serve did not start:\n{log.read_text()}")
             time.sleep(0.1)
         yield
         server.send_signal(signal.SIGINT)

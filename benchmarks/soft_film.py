@@ -165,8 +165,8 @@ def _stitch(scene: SceneConfig, seed: int) -> list[tuple[str, Image]]:
     tissue = tissue_of(env)
     expert = Expert(env)
     eye = Eye(env, CLOSE, CLOSE_MM)
-    moments = {OUTSIDE: "the tip presses", INSIDE: "it lifts the skin from inside"}
-    moments |= {THROUGH: "the needle is drawn through", TRAILING: "its end leaves"}
+    moments = {OUTSIDE: "the tip presses", INSIDE: "the tip lifts the skin from inside"}
+    moments |= {THROUGH: "the needle is drawn through", TRAILING: "the needle's end leaves"}
     found = []
     stage = OUTSIDE
     image = eye.look(middle(env))
@@ -182,7 +182,7 @@ def _stitch(scene: SceneConfig, seed: int) -> list[tuple[str, Image]]:
         if ended:
             break
     eye.close()
-    return [*found, ("the wounds stay", image)]
+    return [*found, ("the wounds remain", image)]
 
 
 def _jaws(scene: SceneConfig, seed: int) -> tuple[str, Image]:

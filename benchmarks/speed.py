@@ -159,7 +159,7 @@ def measure_step(thread: int, repeats: int) -> dict[str, Any]:
     both()
     if not np.array_equal(env.data.qpos, data.qpos):
         raise SystemExit(
-            "env.step and the bare loop ended in different positions; the comparison is void."
+            "env.step and the bare loop ended in different positions; the comparison is invalid."
         )
     times = np.array([both() for _ in range(repeats)])
     return {
@@ -183,7 +183,7 @@ def measure_tissue(thread: int, repeats: int) -> dict[str, Any]:
     for recording in recordings:
         play(recording)
         if not recording.env.measure()["is_success"]:
-            raise SystemExit("The expert's procedure failed; the comparison is void.")
+            raise SystemExit("The expert's procedure failed; the comparison is invalid.")
     soft, channels = (functools.partial(play, recording) for recording in recordings)
     times = in_turns(soft, channels, repeats)
     rates = [
@@ -464,8 +464,8 @@ def main() -> None:
     )
     parser.add_argument("--only", choices=parts, nargs="+", default=parts)
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--frames", type=int, default=100, help="frames or vector steps in a turn")
-    parser.add_argument("--share", type=int, default=16, help="envs per worker of our vector env")
+    parser.add_argument("--frames", type=int, default=100, help="frames or vector steps per turn")
+    parser.add_argument("--share", type=int, default=16, help="envs per worker of the vector env")
     parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
     chosen = parser.parse_args()
     Clock.now = staticmethod(CLOCKS[chosen.clock])

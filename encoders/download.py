@@ -61,8 +61,8 @@ def fetch(source: str, revision: str, filename: str, sha256: str | None, folder:
         if wanted and not actual.startswith(wanted):
             partial.unlink()
             raise BadFile(
-                f"{url} gave a file with sha256 {actual}, expected {wanted}; "
-                "it was deleted. Try again later."
+                f"The file from {url} has sha256 {actual}, expected {wanted}; it was deleted. "
+                "Try again later."
             )
         os.replace(partial, target)
     return target
@@ -82,11 +82,11 @@ def _complete(url: str, file: BinaryIO, size: int | None, name: str) -> None:
                 return
             if file.tell() == before:
                 raise BrokenOff(
-                    f"the download of {url} broke off after {before} of {size} bytes ({problem})"
+                    f"the download of {url} stopped after {before} of {size} bytes ({problem})"
                 )
     if file.tell() != size:
         file.truncate(0)
-        raise BrokenOff(f"{url} gave more than the {size} bytes it announced")
+        raise BrokenOff(f"{url} sent more than the {size} bytes it announced")
 
 
 def _append(url: str, file: BinaryIO, show: Callable[[int], None]) -> None:

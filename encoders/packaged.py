@@ -74,8 +74,8 @@ def network_from(tensors: "dict[str, torch.Tensor]", where: object) -> "nn.Modul
     shapes = [tuple(tensor.shape) for tensor in tensors.values()]
     if shapes != [tuple(tensor.shape) for tensor in wanted.values()]:
         raise BadFile(
-            f"{where} does not hold EfficientNet-Lite0: "
-            f"{len(shapes)} tensors, {len(wanted)} wanted."
+            f"{where} does not hold EfficientNet-Lite0: {len(shapes)} tensors, {len(wanted)} "
+            "expected."
         )
     network.load_state_dict(dict(zip(wanted, tensors.values(), strict=True)))
     network.reset_classifier(0)

@@ -37,7 +37,9 @@ def read_tensors(path: Path) -> "dict[str, torch.Tensor]":
         try:
             return load_file(path)
         except (SafetensorError, OSError) as error:
-            raise BadFile(f"{path} is not a whole safetensors file ({_one_line(error)}).") from None
+            raise BadFile(
+                f"{path} is not a complete safetensors file ({_one_line(error)})."
+            ) from None
     return read_torch(path)
 
 
@@ -49,7 +51,7 @@ def read_torch(path: Path) -> "dict[str, torch.Tensor]":
         content = torch.load(path, map_location="cpu", weights_only=True)
     except DAMAGED as error:
         raise BadFile(
-            f"{path} is not a whole torch file of weights alone ({_one_line(error)})."
+            f"{path} is not a complete torch file that holds only weights ({_one_line(error)})."
         ) from None
     for wrapper in ("state_dict", "model", "r3m"):
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
@@ -78,12 +80,12 @@ def load_exactly(
     for problem, names in (
         ("lacks", missing),
         ("holds unexpected", unexpected),
-        ("has the wrong shape of", shapes),
+        ("has the wrong shape for", shapes),
     ):
         if names:
             raise BadFile(
                 f"{where} {problem} {len(names)} of {len(wanted)} tensors ('{names[0]}' first): "
-                "not weights of this architecture."
+                "these are not weights of this architecture."
             )
     network.load_state_dict(dict(tensors), strict=False)
 

@@ -73,9 +73,9 @@ def missing_line(card: EncoderCard, offline_encoders: tuple[str, ...], problem: 
     reason = f" ({problem})" if problem else ""
     return (
         f"Encoder '{card.name}' needs {card.filename} of the hub repository {card.source} "
-        f"(revision {card.revision}, sha256 {card.sha256 or 'unpinned'}), and it is neither here "
-        f"nor downloadable{reason}; hand it over with --weights FILE or put it in the folder "
-        f"${FOLDER_VARIABLE}. Encoders that work offline: {', '.join(offline_encoders)}."
+        f"(revision {card.revision}, sha256 {card.sha256 or 'unpinned'}), which is neither on "
+        f"this machine nor downloadable{reason}; pass it with --weights FILE or put it in the "
+        f"folder ${FOLDER_VARIABLE}. Encoders that work offline: {', '.join(offline_encoders)}."
     )
 
 
@@ -117,7 +117,8 @@ def check_hash(path: Path, sha256: str | None) -> Path:
     """Return `path` if its hash is `sha256` begins so (or None is known), else refuse it."""
     if sha256 is not None and not (actual := sha256_file(path)).startswith(sha256):
         raise BadFile(
-            f"{path} is damaged or another file: sha256 {actual}, expected {sha256}; replace it."
+            f"{path} is damaged or is a different file: sha256 {actual}, expected {sha256}; "
+            "replace it."
         )
     return path
 
@@ -146,7 +147,7 @@ def _downloaded(card: EncoderCard) -> tuple[Path | None, str]:
     except BadFile:
         raise
     except BrokenOff as error:
-        return None, f"{error}; what has come is kept, and the same command goes on"
+        return None, f"{error}; what was downloaded is kept; run the same command to resume"
     except Exception as error:  # whatever the network did, the answer to the user is the same line
         return None, (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
 

@@ -47,7 +47,10 @@ last = env.unwrapped.get_state()
 env.unwrapped.set_state_vector(halfway)
 for action in actions[20:]:
     env.unwrapped.step(action)
-print(f"the same again from step 20: {np.array_equal(env.unwrapped.get_state(), last)}")
+print(
+    "replayed from step 20, the same final state: "
+    f"{np.array_equal(env.unwrapped.get_state(), last)}"
+)
 
 Image.fromarray(observation["front"]).save("environment.png")
 print("the last image: environment.png")

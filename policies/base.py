@@ -136,19 +136,23 @@ class Recipe:
             )
         check_positive(learning_rate=self.learning_rate)
         if self.setpoint and (self.privileged or not self.proprioception):
-            raise InputError("setpoint goes with proprioception; switch it on, and privileged off.")
+            raise InputError(
+                "setpoint needs proprioception; switch proprioception on and privileged off."
+            )
         if self.clock and (self.privileged or not self.proprioception):
-            raise InputError("clock goes with proprioception; switch it on, and privileged off.")
+            raise InputError(
+                "clock needs proprioception; switch proprioception on and privileged off."
+            )
         if self.clock and self.frame_stride % CLOCK_PERIOD == 0:
             raise InputError(
-                f"frame_stride is {self.frame_stride}: the clock's hand goes round in "
-                f"{CLOCK_PERIOD} steps and would stand still in all frames trained on; take "
-                "another stride, or clock=false."
+                f"frame_stride is {self.frame_stride}: the clock repeats every {CLOCK_PERIOD} "
+                "steps, so it would have the same value in all training frames; use another "
+                "stride, or clock=false."
             )
         if self.progress_input and (self.clock or self.privileged or not self.proprioception):
             raise InputError(
-                "progress_input goes with proprioception, in the place of the clock; switch "
-                "proprioception on, clock and privileged off."
+                "progress_input needs proprioception and replaces the clock; switch "
+                "proprioception on, and clock and privileged off."
             )
         check_at_least(0, weight_decay=self.weight_decay)
         if not self.proprioception_noise >= 0 or self.map_shift < 0:
@@ -158,7 +162,8 @@ class Recipe:
             )
         if self.proprioception_noise and (self.privileged or not self.proprioception):
             raise InputError(
-                "proprioception_noise goes with proprioception; switch it on, and privileged off."
+                "proprioception_noise needs proprioception; switch proprioception on and "
+                "privileged off."
             )
         if not 0 <= self.validation < 1:
             raise InputError(f"validation is {self.validation}; give a share from 0 to below 1.")
@@ -225,8 +230,8 @@ def visual_shapes(recipe: Recipe, visual: Sequence[tuple[int, ...]]) -> tuple[tu
         return tuple(visual)
     if any(len(shape) != 3 or shape[1:] != visual[0][1:] for shape in visual):
         raise InputError(
-            f"join_views is for feature maps of one size; these are {tuple(visual)}. Take "
-            "--pool spatial, or leave join_views out."
+            f"join_views needs feature maps of equal size; these are {tuple(visual)}. Use --pool "
+            "spatial, or leave join_views out."
         )
     return ((sum(shape[0] for shape in visual), *visual[0][1:]),)
 
@@ -376,8 +381,8 @@ class Policy(nn.Module, abc.ABC):
         wide = sum(VECTORS[key] for key in keys)
         if agent_pos.shape[1:] != (wide,) or (parts and len(parts[0]) != len(agent_pos)):
             raise InputError(
-                f"{' + '.join(keys)} must be (batch, {wide}) with one row an image, "
-                f"got {agent_pos.shape}."
+                f"{' + '.join(keys)} must be (batch, {wide}) with one row per image, got "
+                f"{agent_pos.shape}."
             )
         if self.inputs.vector:
             parts.append(agent_pos)

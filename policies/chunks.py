@@ -82,7 +82,7 @@ class ChunkRecipe(Recipe):
                 f"clip_gradient is {self.clip_gradient}, minutes {self.minutes}; at least 0."
             )
         if not self.proprioception and not self.privileged:
-            raise InputError("A policy that plans chunks needs its state; keep proprioception.")
+            raise InputError("A policy that plans chunks needs proprioception; keep it on.")
 
 
 class ChunkPolicy(Policy, abc.ABC):
@@ -194,7 +194,8 @@ class ChunkPolicy(Policy, abc.ABC):
         """
         if vectors.shape[1:2] != (self.history,):
             raise InputError(
-                f"The policy sees {self.history} moments, got vectors of {vectors.shape}."
+                f"The policy sees {self.history} observations at a time, got vectors of "
+                f"{vectors.shape}."
             )
         flat = self.observed(
             None if features is None else features.reshape(-1, features.shape[-1]),

@@ -126,8 +126,7 @@ def _head(shape: tuple[int, ...], map_head: str) -> Head:
     }
     if len(shape) not in heads:
         raise InputError(
-            f"A feature of shape {shape} cannot be taken in; "
-            "allowed are (dim,), (C, h, w) and (N, C)."
+            f"A feature of shape {shape} cannot be used; allowed are (dim,), (C, h, w) and (N, C)."
         )
     return heads[len(shape)](*shape)
 

@@ -38,8 +38,8 @@ def _make(kind: str, recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> Pol
         adapter = importlib.import_module(ADAPTER)
     except ImportError as error:
         raise InputError(
-            f"LeRobot's policies need the distribution lerobot_env_surgicai ({error}); "
-            "install it beside surgicai-vision."
+            f"LeRobot's policies need the distribution lerobot_env_surgicai ({error}); install "
+            "it alongside surgicai-vision."
         ) from None
     policy: Policy = vars(adapter)[kind](recipe, visual)
     return policy

@@ -97,7 +97,7 @@ def figures() -> list[Figure]:
         Figure("imports of our own modules inside functions outside commands/", local, 10),
         Figure(f"lines over {WIDTH} columns", wide, 0),
         Figure("parallel assignments per 1,000 lines", round(packed / thousands, 1), 2),
-        Figure("module files named by a gerund (but rendering, training)", gerunds, 0),
+        Figure("module files named by a gerund (except rendering, training)", gerunds, 0),
         Figure("lines with 'picture'", pictures, 5),
         Figure("loose modules", len(loose - {"__init__.py", "__main__.py"}), 0),
         Figure("lines of the four packages", package_lines, 30_000, binds=False),

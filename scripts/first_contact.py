@@ -129,14 +129,16 @@ def attempt(situation: Situation, scratch: Path) -> str:
         return f"a traceback: {last}"
     if situation.refused:
         clear = done.returncode == 2 and situation.refused in last
-        return "" if clear else f"code {done.returncode}, and not '{situation.refused}': {last}"
+        return (
+            "" if clear else f"code {done.returncode}, expected 2 and '{situation.refused}': {last}"
+        )
     if done.returncode:
         return f"code {done.returncode}: {last}"
     warned = [line for line in complaint.splitlines() if "arning" in line]
     if warned:
         return f"a warning: {warned[0]}"
     whole = all((folder / "schöne Naht" / name).is_file() for name in OUTPUTS)
-    return "" if whole else f"{', '.join(OUTPUTS)} are not all there"
+    return "" if whole else f"{', '.join(OUTPUTS)} do not all exist"
 
 
 OUTPUTS = ("report.html", "procedure/procedure.mp4", "procedure/strip.jpg")
@@ -152,7 +154,7 @@ def main(chosen: list[str]) -> int:
         situation = SITUATIONS[name]
         why_not = situation.needs()
         if why_not:
-            print(f"left out  {name}: {why_not}", flush=True)
+            print(f"skipped   {name}: {why_not}", flush=True)
             continue
         with tempfile.TemporaryDirectory(prefix="first-contact-") as scratch:
             Path(scratch).chmod(0o755)

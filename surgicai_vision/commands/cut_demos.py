@@ -16,7 +16,7 @@ app = App(
     help_epilogue="""\
 example:
   surgicai-vision cut-demos --demos outputs/demos/recover --subtask grasp
-then, with demonstrations of the subtask's own:
+then, together with demonstrations of the subtask alone:
   surgicai-vision render-demos --demos outputs/demos/grasp,outputs/demos/grasp-visits""",
 )
 

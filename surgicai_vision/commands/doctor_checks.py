@@ -166,7 +166,7 @@ def check_names() -> Check:
             "import names",
             "fail",
             "; ".join(wrong),
-            f"let {DISTRIBUTION} alone own them: pip uninstall the other",
+            f"pip uninstall the other distribution, so that only {DISTRIBUTION} owns them",
         )
     return Check("import names", "ok", f"{', '.join(PACKAGES)} belong to {DISTRIBUTION}")
 
@@ -194,9 +194,9 @@ def check_gl(finding: Finding) -> Check:
     backend = os.environ.get("MUJOCO_GL") or "egl"
     if "error" in finding:
         if finding.get("is_plugin"):
-            advice = "repair or uninstall the distribution that is named"
+            advice = "repair or uninstall the distribution named in the error"
         elif "renderer" in finding:
-            advice = "GL works and our scene does not: report it"
+            advice = "GL works but our scene does not: report it"
         else:
             advice = GL_LINE
         return Check("GL", "fail", f"{backend}: nothing renders ({finding['error']})", advice)
@@ -215,10 +215,10 @@ def check_gpu(finding: Finding) -> Check:
         return Check(
             "GPU",
             "warning",
-            "an NVIDIA driver is here, but torch sees no GPU",
-            "compare nvidia-smi",
+            "an NVIDIA driver is installed, but torch sees no GPU",
+            "check the output of nvidia-smi",
         )
-    return Check("GPU", "ok", "none; everything runs on the processor")
+    return Check("GPU", "ok", "none; everything runs on the CPU")
 
 
 def check_encoders(finding: Finding) -> Iterator[Check]:
@@ -333,15 +333,15 @@ def _found_weights(name: str) -> FoundWeights:
     except Exception as error:  # whatever it is, the other encoders are still reported
         owner = encoders.ENCODERS.distribution(name)
         return {"here": False, "detail": first_line(error), "broken": owner}
-    unpinned = "" if card.sha256 else " (unpinned: the hub's own hash is taken)"
+    unpinned = "" if card.sha256 else " (unpinned: the Hub's own hash is used)"
     try:
         path = encoders.find_weights(name, encoders.WeightsSource(accept_licence=True))
     except MissingWeights:
-        detail = f"{card.filename} of {card.source} is not here{unpinned}"
+        detail = f"{card.filename} of {card.source} is not on this machine{unpinned}"
         return {"here": False, "detail": detail, "broken": ""}
     except SurgicaiError as error:
         return {"here": False, "detail": str(error), "broken": ""}
-    detail = f"{path}{unpinned}" if path else f"{card.source} {card.revision}, always here"
+    detail = f"{path}{unpinned}" if path else f"{card.source} {card.revision}, always available"
     return {"here": True, "detail": detail, "broken": ""}
 
 

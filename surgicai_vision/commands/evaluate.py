@@ -40,8 +40,9 @@ app = App(
 example:
   surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json
 
-A policy is evaluated in the world it was trained in, also one that varies; a --config file with
-`env: {randomisation: …}` gives another, and with `env: {randomisation: {}}` the standing one.""",
+A policy is evaluated in the world it was trained in, even if that world varies. A --config file
+with `env: {randomisation: …}` chooses another world, and `env: {randomisation: {}}` the standing
+world, where nothing varies.""",
 )
 
 ALL = "all"
@@ -170,7 +171,7 @@ def say_conditions(seeds: range, config: TaskConfig, console: Console) -> None:
     if config.randomisation.on:
         console.say(
             f"world: varies ({config.randomisation.text}); `env: {{randomisation: {{}}}}` in a "
-            "--config file evaluates in the standing one"
+            "--config file evaluates in the standing world"
         )
 
 
@@ -200,7 +201,7 @@ def open_given(
     if policy == REPLAY:
         demonstrated = folders.open_dataset(dataset, task or "grasp", ())
     elif dataset:
-        raise InputError("--dataset is for replay alone; leave it out.")
+        raise InputError("--dataset is only for replay; leave it out.")
     return open_policy(
         policy,
         task=task,
@@ -279,7 +280,7 @@ def summary_line(result: dict[str, Any]) -> str:
         )
     if "ends" in result:
         late = result["end_delay_s"]["mean"]
-        line += f"; {result['false_ends']['mean']:.2f} false ends a procedure"
+        line += f"; {result['false_ends']['mean']:.2f} false ends per procedure"
         line += "" if late is None else f", the others {late:.2f} s after the measured success"
     return line + _bite(result)
 

@@ -80,7 +80,7 @@ def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> "Rende
     if not path.exists():
         command = f"surgicai-vision render-demos --task {task} --episodes 50"
         raise BadFile(
-            f"There is no dataset {path}; make it by `{command}`, or give one with --dataset DIR."
+            f"There is no dataset {path}; make it with `{command}`, or give one with --dataset DIR."
         )
     from surgicai_vision.dataset.reader import open_dataset as open_folder
 

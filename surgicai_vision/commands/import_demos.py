@@ -34,15 +34,15 @@ example:
   surgicai-vision import-demos regrasp_all_episodes_merged.pkl --task handoff \\
       --out outputs/demos/surgicai
 
-A bag is a .bag, .db3 or .mcap file, or a folder of ROS 2; a folder of bags is read whole:
+A bag is a .bag, .db3 or .mcap file, or a ROS 2 folder; a folder of bags is read whole:
   surgicai-vision import-demos trial.bag --topic needle=/needle/pose --out outputs/demos/trial
-A LeRobot dataset (v2.1 or v3) of both arms' poses, as Open-H-Embodiment and SutureBot have them:
+A LeRobot dataset (v2.1 or v3) of both arms' poses, as in Open-H-Embodiment and SutureBot:
   surgicai-vision import-demos datasets/suturing --out outputs/demos/suturing
-What a policy did at a robot, as robot drive logged it:
+What a policy did on a robot, as logged by robot drive:
   surgicai-vision import-demos outputs/drive/suture/drive.jsonl --out outputs/demos/driven
 Roles of --topic: {", ".join(ROLES)}.
-Without --task every subtask that is found gets a folder below --out. Frames, units, labels and more
-stand in the table `bag` of a --config file, the scene in the table `env`; see docs/demos.md.\
+Without --task, every subtask that is found gets a folder below --out. Frames, units, labels and
+more are set in the table `bag` of a --config file, the scene in the table `env` (docs/demos.md).\
 """,
 )
 
@@ -63,7 +63,7 @@ class Options:
     """
 
     file: Annotated[Path, Parameter(metavar="FILE")] = field(kw_only=False)
-    task: Annotated[str | None, SUBTASK, default_text("of a bag all that is found")] = None
+    task: Annotated[str | None, SUBTASK, default_text("for a bag, every subtask found")] = None
     out: Annotated[
         Path | None, DIRECTORY, default_text("outputs/demos/surgicai-<task> or outputs/demos/bag")
     ] = None
@@ -100,7 +100,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     given = [name for name, value in for_bags.items() if value]
     if given:
         raise InputError(
-            f"{given[0]} is for bags, and {path} is none (*.bag, *.db3, *.mcap, a folder of ROS 2)."
+            f"{given[0]} is for bags, and {path} is not one (*.bag, *.db3, *.mcap, a ROS 2 folder)."
         )
     return _import_surgicai(path, options, console)
 
@@ -110,7 +110,7 @@ def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str
 
     if options.task is None:
         raise InputError(
-            "import-demos needs --task: the file does not say it; one of "
+            "import-demos needs --task: the file does not name its task; give one of "
             f"{', '.join(names.SUBTASKS)}."
         )
     out = options.out or folders.demos_folder(f"surgicai-{options.task}")
@@ -139,7 +139,7 @@ def _import_dataset(path: Path, options: Options, console: Console) -> dict[str,
 
     _refuse_topics(
         options,
-        "a LeRobot dataset; frames, labels and more stand in the table bag of a --config file",
+        "a LeRobot dataset; frames, labels and more are set in the table bag of a --config file",
     )
     out = options.out or folders.demos_folder(f"dataset-{path.resolve().name}")
     return _import_arms(import_dataset, options, out, "frames", console)
@@ -148,7 +148,7 @@ def _import_dataset(path: Path, options: Options, console: Console) -> dict[str,
 def _import_drive_log(path: Path, options: Options, console: Console) -> dict[str, object]:
     from surgicai_vision.demos.imports.drive_log import import_drive_log
 
-    _refuse_topics(options, "a log of drive")
+    _refuse_topics(options, "a log of robot drive")
     out = options.out or folders.demos_folder("drive")
     return _import_arms(import_drive_log, options, out, "demonstrations", console)
 
@@ -209,7 +209,7 @@ def _told(summaries: "Sequence[BagSummary]", console: Console) -> dict[str, dict
         kept = len(made.paths)
         console.say(
             f"{kept} demonstrations of {made.task}, {made.steps} steps; {made.succeeded} of {kept} "
-            f"end as a success by our tolerances: {made.out}"
+            f"end in success by our tolerances: {made.out}"
         )
         if made.skipped:
             console.say(

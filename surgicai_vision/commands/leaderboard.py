@@ -44,7 +44,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         folders.check_file(page, "--out", (".html",))
     board = write_leaderboard(options.dir, page)
     for name, reason in board.refused.items():
-        console.say(f"not taken: {name}: {reason}")
+        console.say(f"rejected: {name}: {reason}")
     console.say(f"{len(board.taken)} rows: {board.page}")
     return {
         "page": str(board.page),

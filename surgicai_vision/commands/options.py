@@ -53,7 +53,7 @@ def _refuse_repetition(_: type, values: Sequence[object] | None) -> None:
 
 def _refuse_text(_: type, tokens: Sequence[Token]) -> None:
     """Raise ValueError: a table cannot be given on the command line."""
-    raise ValueError(f"'{tokens[0].value}' is given, but this table stands in a --config file.")
+    raise ValueError(f"'{tokens[0].value}' is given, but this table belongs in a --config file.")
 
 
 def _check_encoder(_: type, name: str) -> None:
@@ -134,7 +134,7 @@ PolicyName = Annotated[
 """What `evaluation.policy_spec.open_policy` takes."""
 PolicyTask = Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")]
 EvaluationWorkers = Annotated[
-    int | None, COUNT, default_text("one a core, at most one for four episodes")
+    int | None, COUNT, default_text("one per core, at most one per four episodes")
 ]
 DatasetFolder = Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")]
 WeightFiles = Annotated[
@@ -161,7 +161,7 @@ def task_config(task: str, env: dict[str, object] | None) -> TaskConfig:
     """
     changes = env or {}
     if "task" in changes:
-        raise InputError("env: the task is an option of its own; write `task:` beside `env:`.")
+        raise InputError("env: the task is a separate option; write `task:` next to `env:`.")
     return from_mapping(TaskConfig, {**changes, "task": task}, "env")
 
 
@@ -213,7 +213,7 @@ def _parts(text: str, name: str) -> list[str]:
     """
     parts = [part.strip() for part in text.split(",")]
     if not all(parts):
-        problem = f"is '{text}'; expected names between commas" if len(parts) > 1 else "is empty"
+        problem = f"is '{text}'; separate the names by commas" if len(parts) > 1 else "is empty"
         raise InputError(f"{name} {problem}.")
     return parts
 
@@ -257,7 +257,7 @@ def _writable(text: str, where: str) -> str:
         encoded = b"\0"
     if b"\0" in encoded:
         raise InputError(
-            f"{where}: {shown(text)} holds a character that no name has; leave it out."
+            f"{where}: {shown(text)} contains a character that no name can contain; leave it out."
         )
     return text
 

@@ -69,7 +69,7 @@ def run(*, console: Console) -> dict[str, object]:
         if line.problem:
             console.say(f"{line.policy}: {line.problem}")
     if not lines:
-        console.say(f"No policy is released in {released_folder()}.")
+        console.say(f"There is no released policy in {released_folder()}.")
     if not lines or not all(line.usable for line in lines):
         console.say("`surgicai-vision release` builds them for the present scene (hours).")
     return {"folder": str(released_folder()), "policies": [asdict(line) for line in lines]}

@@ -73,12 +73,12 @@ class Options:
     episodes: Annotated[int, COUNT] = 50
     demonstrator: str = "expert"
     from_: Annotated[Path | None, Parameter(metavar="DEMOS")] = None
-    demos_used: Annotated[int | None, COUNT, default_text("1 of dmp, all of multiply")] = None
+    demos_used: Annotated[int | None, COUNT, default_text("1 for dmp, all for multiply")] = None
     source: Annotated[str | None, Parameter(choices=SOURCES), default_text("nearest")] = None
     seed: Annotated[int, SEED] = names.TRAIN_SEED
     noise: Annotated[float, FRACTION, Parameter(metavar="SIGMA")] = 0.0
     noise_from: Annotated[
-        float | None, FRACTION, Parameter(metavar="SIGMA"), default_text("--noise itself")
+        float | None, FRACTION, Parameter(metavar="SIGMA"), default_text("the value of --noise")
     ] = None
     jaw_noise: Annotated[float, FRACTION, Parameter(metavar="SIGMA")] = 0.0
     perturb_start_fraction: Annotated[float, FRACTION] = 0.0
@@ -140,7 +140,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     console.say(f"{len(paths)} demonstrations of {options.task}: {out}")
     console.say(
         f"{len(paths)}/{tried} starts succeeded (95 % interval {interval(bounds)})"
-        + (f"; {out / MARKER} names the others." if tried > len(paths) else ".")
+        + (f"; {out / MARKER} lists the others." if tried > len(paths) else ".")
     )
     upsets = marker.get("upsets", {})
     for kind, count in sorted(upsets.items()):

@@ -15,7 +15,7 @@ app = App(
     help_epilogue="""\
 example:
   surgicai-vision release --only grasp
-to try it in minutes, away from the package's own policies:
+to try it in minutes, in a folder apart from the package's own policies:
   SURGICAI_VISION_RELEASED=outputs/tried surgicai-vision release \\
       --demonstrations 5 --epochs 1 --episodes 2 --out outputs/release-tried""",
 )

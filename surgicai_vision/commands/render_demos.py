@@ -65,13 +65,13 @@ class Options:
     demos: Annotated[
         tuple[Path, ...],
         Parameter(metavar="DIR[,DIR]"),
-        default_text("record the expert's into outputs/demos/<task>"),
+        default_text("record the expert's in outputs/demos/<task>"),
     ] = ()
     task: Annotated[str | None, TASK, default_text("grasp")] = None
     episodes: Annotated[int | None, COUNT, default_text("50")] = None
     seed: Annotated[int, SEED] = names.TRAIN_SEED
     view: Annotated[
-        tuple[str, ...], VIEWS, default_text("front,back; of open-h its endoscope and wrists")
+        tuple[str, ...], VIEWS, default_text("front,back; for open-h its endoscope and wrist views")
     ] = ()
     layout: Annotated[str, Parameter(choices=("surgicai", "open-h"))] = "surgicai"
     size: Annotated[int, IMAGE_SIZE] = 224
@@ -90,7 +90,7 @@ class Options:
     workers: Annotated[int, COUNT] = folders.CORES
     executor: Annotated[str, EXECUTOR] = "local"
     out: Annotated[
-        Path | None, DIRECTORY, default_text("outputs/datasets/<task>, of open-h <task>-open-h")
+        Path | None, DIRECTORY, default_text("outputs/datasets/<task>, for open-h <task>-open-h")
     ] = None
     env: EnvFields = None
 

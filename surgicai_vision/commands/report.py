@@ -46,7 +46,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     folder = options.dir
     if not folder.is_dir():
         raise BadFile(
-            f"{folder} is no folder; give one that quickstart, evaluate or sweep has written."
+            f"{folder} is not a folder; give one that quickstart, evaluate or sweep has written."
         )
     folders.check_file(options.out or folder / PAGE_FILE, "--out", (".html",))
     planned = _planned(folder, console)

@@ -16,7 +16,7 @@ app = App(
     help_epilogue="""\
 example:
   surgicai-vision submit outputs/evaluate/mine --name "My policy" --by "Jane Doe" --minutes 25
-the evaluation that it takes:
+an evaluation that it accepts:
   surgicai-vision evaluate outputs/train/mine --episodes 100 --out outputs/evaluate/mine""",
 )
 
@@ -66,7 +66,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     _check_out(out)
     write_row(row, out)
     console.say(f"row: {out}")
-    console.say("next: send it as docs/submit.md says")
+    console.say("next: send it as described in docs/submit.md")
     return {"row": str(out), "digest": row.digest, "successes": sum(row.successes)}
 
 

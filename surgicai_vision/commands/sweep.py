@@ -33,9 +33,9 @@ app = App(
     help_epilogue="""\
 example:
   surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json
-a headline from nothing, for its first training seed; without --only for all of them:
+a headline from scratch, for its first training seed; without --only, for all of them:
   surgicai-vision sweep procedure --only seed=0
-algorithms of reinforcement learning:
+reinforcement-learning algorithms:
   surgicai-vision sweep rl-demonstrations --only algo=td3-her-bc task=grasp
 to try a file in minutes:
   surgicai-vision sweep procedure --demonstrations 5 --epochs 1 --episodes 2 --size 64""",
@@ -76,7 +76,7 @@ class Options:
     attempts: Annotated[int, COUNT] = 3
     executor: Annotated[str, EXECUTOR] = "local"
     device: Annotated[
-        str | None, DEVICE, default_text("encode on a GPU where there is one, train on the CPU")
+        str | None, DEVICE, default_text("encode on a GPU if there is one, train on the CPU")
     ] = None
 
 
@@ -134,9 +134,9 @@ def _list(
     seconds = estimate(states, out, workers)
     told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
     rest = (
-        "how long they take is known once the first is finished"
+        "how long they take is known once the first has finished"
         if seconds is None
-        else f"about {_duration(seconds)} with {workers} workers, by what the finished ones took"
+        else f"about {_duration(seconds)} with {workers} workers, judging by the finished ones"
     )
     console.say(f"{len(states)} runs: {told}; {rest}.")
     return {"runs": len(states), **counts, "seconds": seconds, "dry_run": True}

@@ -35,7 +35,7 @@ example:
 keys (by their place on a US keyboard) and gamepad:
 {key_table()}
 
-Only successes are kept. The same command goes on where a session was stopped or killed.""",
+Only successes are kept. The same command continues a session that was stopped or killed.""",
 )
 SECONDS = 60.0
 """Time a subtask may take [s]; the paper's 4 s suit a policy, not a person."""
@@ -76,7 +76,7 @@ class Options:
         Parameter(validator=validators.Number(gte=0.1, lte=3600)),
         default_text(f"{SECONDS:g}, {SECONDS * len(names.SUBTASKS):g} for {names.SUTURE}"),
     ] = None
-    episodes: Annotated[int | None, COUNT, default_text("go on until Esc")] = None
+    episodes: Annotated[int | None, COUNT, default_text("continue until Esc")] = None
     seed: Annotated[int | None, SEED, default_text(str(names.TRAIN_SEED))] = None
     auto_keep: bool = False
     keep_failures: bool = False
@@ -141,7 +141,7 @@ def _config(options: Options) -> TaskConfig:
     config = task_config(options.task, options.env)
     if options.env and options.env.get("max_steps"):
         if options.seconds is not None:
-            raise InputError("--seconds and env: max_steps say the same; give one of them.")
+            raise InputError("--seconds and env: max_steps set the same limit; give only one.")
         return config
     subtasks = len(names.SUBTASKS) if options.task == names.SUTURE else 1
     seconds = SECONDS * subtasks if options.seconds is None else options.seconds

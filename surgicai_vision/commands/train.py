@@ -48,10 +48,10 @@ app = App(
     help_epilogue="""\
 example:
   surgicai-vision train --encoder imagenet-lite --view back
-LeRobot's ACT on feature maps, for ten minutes of a core:
+LeRobot's ACT on feature maps, for ten minutes on one core:
   surgicai-vision train --task handoff --policy act --encoder imagenet-lite-early --pool spatial \\
     --view front_psm1 --minutes 10
-by reinforcement:
+reinforcement learning:
   surgicai-vision train --algo td3-her-bc --env-steps 25000
 a correction of an image policy:
   surgicai-vision train --algo td3 --env-steps 20000 \\
@@ -91,7 +91,9 @@ class Options:
         start: Checkpoint, or released:NAME, to start from, with the same inputs (fine-tuning).
         progress_from: Checkpoint, or released:NAME, of a high-level policy; it predicts the
             progress that a recipe with progress_input=true feeds to the policy.
-        save_every: Also keep a checkpoint every N epochs; 0 keeps only the last.
+        save_every: Also keep a checkpoint every N epochs; 0 keeps only the last. With --algo,
+            evaluate and save the training state every N control steps (offline algorithms: updates;
+            with --low: decisions); 0 means 5000 (with --low: 500).
         log: Where to log losses; auto uses TensorBoard if it is installed.
         seed: Training seed.
         out: Checkpoint folder to create or continue.
@@ -139,7 +141,7 @@ class Options:
             help=f"Recipe of the policy: {', '.join(policies.recipe_names())}, or FILE.yaml.",
             metavar="NAME",
         ),
-        default_text("the policy's name where a recipe has it, else paper"),
+        default_text("the recipe named like the policy if there is one, else paper"),
     ] = None
     change: Annotated[
         tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]"), default_text("none")
@@ -149,7 +151,7 @@ class Options:
         float | None, Parameter(validator=validators.Number(gt=0)), default_text("the recipe's")
     ] = None
     device: Annotated[
-        str | None, DEVICE, default_text("encode on a GPU where there is one, train on the CPU")
+        str | None, DEVICE, default_text("encode on a GPU if there is one, train on the CPU")
     ] = None
     start: Annotated[Path | None, DIRECTORY] = None
     progress_from: Annotated[Path | None, DIRECTORY] = None
@@ -219,9 +221,10 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     is_high_level = policies.policy_plugin(run.policy).target == names.STAGE
     if rendered.late and not is_high_level:
         console.note(
-            f"warning: demonstrations of {rendered.path} notice a loss up to {rendered.late} "
-            "control steps late (record-demos --late) and act until then as if they held the "
-            f"needle; '{run.policy}' learns that too. `cut-demos` takes a subtask's visits without."
+            f"warning: demonstrations of {rendered.path} notice a lost needle up to "
+            f"{rendered.late} control steps late (record-demos --late) and until then act as if "
+            f"they still held it; '{run.policy}' learns that too. `cut-demos` takes a subtask's "
+            "visits without it."
         )
     dataset: Dataset = rendered
     if options.demonstrations or options.subtask:
@@ -259,7 +262,7 @@ def _tell_errors(checkpoint: Checkpoint, console: Console) -> None:
     if errors is None:
         return
     console.say(
-        f"held-out frames: {errors.right} of {errors.frames} subtasks named rightly, calibration "
+        f"held-out frames: {errors.right} of {errors.frames} subtasks named correctly, calibration "
         f"error {errors.calibration_error:.3f}"
     )
     if errors.progress_error is not None:
@@ -297,7 +300,7 @@ def _refuse_reinforcement(options: Options) -> None:
             option = name.replace("_", "-")
             raise InputError(
                 f"--{option} is for --algo, and imitation from a dataset does not read it; leave "
-                "it out" + (", and give --seed, one call each." if name == "seeds" else ".")
+                "it out" + (", and run once for each --seed." if name == "seeds" else ".")
             )
 
 
@@ -319,7 +322,7 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
         demos = list_demos(options.demos or folders.demos_folder(options.task))
         demos = demos[: options.demonstrations]
     elif options.demos or options.demonstrations:
-        raise InputError(f"--algo {algo} learns from no demonstrations; leave --demos out.")
+        raise InputError(f"--algo {algo} does not learn from demonstrations; leave --demos out.")
     requests = [
         Request(
             algo=algo,
@@ -408,7 +411,7 @@ def _high_level(options: Options, low: Path, console: Console) -> dict[str, obje
         with console.stage(f"high-level policy: {run.name}", "decisions") as progress:
             train_high_level(request, out, progress=progress)
         console.say(f"checkpoint: {out}")
-    console.say(f"next: give {outs[0]} as hlp: of {low}, and surgicai-vision evaluate {low}")
+    console.say(f"next: set hlp: {outs[0]} in {low}, then surgicai-vision evaluate {low}")
     return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}
 
 

@@ -34,7 +34,7 @@ example:
   surgicai-vision watch expert --task suture
 
 Open the address that it prints. On the page: space plays and pauses, → takes one step, N goes to
-the next start, R back to this one's beginning; drag in the view "free" to turn it. Esc ends.""",
+the next start, R to the beginning of this one; drag in the view "free" to turn it. Esc ends.""",
 )
 WEB_PORT = 8766
 
@@ -61,7 +61,7 @@ class Options:
     policy: PolicyName = field(kw_only=False)
     task: PolicyTask = None
     seed: Annotated[int, SEED] = names.TEST_SEED
-    episodes: Annotated[int | None, COUNT, default_text("go on until Esc")] = None
+    episodes: Annotated[int | None, COUNT, default_text("continue until Esc")] = None
     go_on: bool = False
     paused: bool = False
     window: bool = False

@@ -50,6 +50,6 @@ def check_training_starts(seed: int, episodes: int) -> None:
     if bank_of(seed + episodes - 1) != TRAINING:
         raise InputError(
             f"Demonstrations from seed {seed} on, {episodes} of them, reach into the starts that "
-            f"are kept for validation (from {names.VALIDATION_SEED} on) or for tests (from "
+            f"are reserved for validation (from {names.VALIDATION_SEED} on) or for tests (from "
             f"{names.TEST_SEED} on); give a smaller --seed."
         )

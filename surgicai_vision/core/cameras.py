@@ -94,6 +94,6 @@ def _check_form(name: str) -> None:
     """Refuse names that would be misread in a LeRobot key or in one of our files."""
     if not name.isidentifier() or name.endswith(("_depth", "_segmentation")):
         raise InputError(
-            f"No camera can be called '{name}'; take a name of letters, digits and _ that does "
+            f"A camera cannot be called '{name}'; choose a name of letters, digits and _ that does "
             "not end in _depth or _segmentation."
         )

@@ -96,8 +96,8 @@ class SceneConfig:
         check_name("ink", self.ink, names.INKS)
         if self.ink != "alike" and self.tissue != "channels":
             raise InputError(
-                f"ink is {self.ink!r} in {self.tissue} tissue, which marks the pair to be sewn in "
-                "any case; leave it out."
+                f"ink is {self.ink!r} in {self.tissue} tissue, which always marks the pair to be "
+                "sewn; leave it out."
             )
         if self.hole_pair not in (1, 2, 3, 4):
             raise InputError(f"hole_pair is {self.hole_pair!r}; allowed: 1, 2, 3, 4.")
@@ -441,7 +441,7 @@ def read_changes(texts: Iterable[str]) -> dict[str, JSON]:
         try:
             changes[key] = cast(JSON, load_yaml(value))
         except (yaml.YAMLError, ValueError, RecursionError):  # a date that does not exist, …
-            raise InputError(f"change '{key}': {shown(value)} is no YAML value.") from None
+            raise InputError(f"change '{key}': {shown(value)} is not a YAML value.") from None
     return changes
 
 
@@ -464,7 +464,7 @@ def check_frame_stride(frame_stride: int) -> None:
             str(number) for number in range(1, names.FPS + 1) if names.FPS % number == 0
         )
         raise InputError(
-            f"frame_stride is {frame_stride}; it must divide the {names.FPS} frames a second: "
+            f"frame_stride is {frame_stride}; it must divide the {names.FPS} frames per second: "
             f"{allowed}."
         )
 

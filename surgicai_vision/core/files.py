@@ -81,7 +81,7 @@ def read_yaml(path: Path, *, may_be_empty: bool = False) -> dict[str, object]:
     if table is None and may_be_empty:
         return {}
     if not isinstance(table, dict) or not all(isinstance(key, str) for key in table):
-        raise BadFile(f"{path} holds no table of keys; write one `key: value` a line.")
+        raise BadFile(f"{path} is not a table of keys; write one `key: value` per line.")
     return table
 
 

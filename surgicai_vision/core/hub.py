@@ -35,9 +35,9 @@ def connect(repo: str, api: "HfApi | None" = None) -> "HfApi":
     try:
         validate_repo_id(repo)
     except HFValidationError:
-        raise InputError(f"'{repo}' is no name on the Hub; it is written user/name.") from None
+        raise InputError(f"'{repo}' is not a valid name on the Hub; write user/name.") from None
     if repo.count("/") != 1:
-        raise InputError(f"'{repo}' does not say whose it is; write user/name.")
+        raise InputError(f"'{repo}' does not name its owner; write user/name.")
     if api is not None:
         return api
     if constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in (

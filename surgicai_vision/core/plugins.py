@@ -81,7 +81,7 @@ def subclass_of(target: str) -> Fault:
             return f"is {shown(part)}; it must be a subclass of {_public(target)}"
         if inspect.isabstract(part):
             missing = ", ".join(sorted(getattr(part, "__abstractmethods__", ())))
-            return f"lacks what {_public(target)} leaves to it: {missing}"
+            return f"lacks what {_public(target)} requires: {missing}"
         return ""
 
     return fault

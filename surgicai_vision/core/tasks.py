@@ -86,7 +86,7 @@ def load_subtask(name: str) -> "type[Subtask]":
         raise TASKS.refusal(
             name,
             f"calls itself '{subtask.name}'; its author must give the entry point and the class "
-            "one name",
+            "the same name",
         )
     return subtask
 

@@ -47,7 +47,7 @@ class Variants:
             raise InputError(f"corruption is {self.corruption}; allowed: 0 to 1.")
         if not (self.appearance or self.distractors or self.corruption):
             raise InputError(
-                f"{self.count} variants are asked without a look to draw; give an appearance "
+                f"{self.count} variants are requested without a look to draw; give an appearance "
                 "(--appearance train), distractors (--distractors 5) or a corruption "
                 "(--corruption 0.5)."
             )

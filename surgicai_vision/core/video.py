@@ -50,7 +50,7 @@ def write_video(path: Path, frames: Iterable[Image], fps: float) -> int:
     import av
 
     if path.suffix != SUFFIX:
-        raise InputError(f"{path} is no {SUFFIX} file; videos are written as MP4.")
+        raise InputError(f"{path} is not a {SUFFIX} file; videos are written as MP4.")
     rest = iter(frames)
     first = next(rest, None)
     if first is None:
@@ -73,7 +73,7 @@ def write_video(path: Path, frames: Iterable[Image], fps: float) -> int:
             if frame.shape != first.shape:
                 raise InputError(
                     f"{path}: frame {count} has shape {frame.shape}, the first {first.shape}; "
-                    "frames of one video have one size."
+                    "all frames of a video have the same size."
                 )
             image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
             container.mux(stream.encode(image))
@@ -116,7 +116,7 @@ def write_animation(
     from PIL import Image as Pillow
 
     if path.suffix != ANIMATION:
-        raise InputError(f"{path} is no {ANIMATION} file; animations are written as WebP.")
+        raise InputError(f"{path} is not a {ANIMATION} file; animations are written as WebP.")
     images = [Pillow.fromarray(np.ascontiguousarray(frame)) for frame in frames]
     if not images:
         raise InputError(f"{path}: there are no frames to write.")

@@ -84,7 +84,7 @@ def _check_keys(table: yaml.MappingNode) -> None:
         if not isinstance(key, yaml.ScalarNode) or key.tag == MERGE_TAG:
             continue
         if (key.tag, key.value) in met:
-            raise _refused(f"the key '{key.value}' stands twice in one table; keep one", key)
+            raise _refused(f"the key '{key.value}' appears twice in one table; keep one", key)
         met.add((key.tag, key.value))
 
 

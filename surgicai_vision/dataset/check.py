@@ -140,14 +140,14 @@ def _check_lerobot(
         return
     bounds = dataset.bounds()
     if (info.get("total_frames"), info.get("total_episodes")) != (dataset.length, len(bounds)):
-        problems.append("meta/info.json: its counts are not those of the data.")
+        problems.append("meta/info.json: its counts differ from the data.")
     own = schema.columns(dataset.views)
     missing = [key for key in (*keys, *own) if key not in features]
     if missing:
         problems.append(f"meta/info.json: no feature {', '.join(missing)}.")
     expected = [(number, stop - start, start, stop) for number, (start, stop) in enumerate(bounds)]
     if list(zip(*(column.to_pylist() for column in table.columns), strict=True)) != expected:
-        problems.append("meta/episodes: its rows are not the episodes of the data.")
+        problems.append("meta/episodes: its rows do not match the episodes in the data.")
     for key in own:
         _check_statistics(key, statistics.get(key), columns[key], problems)
     problems.extend(
@@ -171,7 +171,7 @@ def _check_statistics(
             given = np.zeros(0)
         fits = given.shape == np.shape(exact[name])
         if not fits or not np.allclose(given, exact[name], atol=STATISTICS_TOLERANCE * scale):
-            problems.append(f"meta/stats.json: {name} of {key} is not that of the data.")
+            problems.append(f"meta/stats.json: {name} of {key} does not match the data.")
 
 
 def _check_episode(

@@ -91,7 +91,7 @@ def convert_dataset(
     check_video(video, dataset.image_size)
     if video and dataset.video:
         raise InputError(
-            f"{path} holds videos already ({dataset.video}); make others from a dataset of images."
+            f"{path} already holds videos ({dataset.video}); convert a dataset of images instead."
         )
     request = {
         "dataset": dataset.meta["digest"],
@@ -123,13 +123,13 @@ def check_video(video: str | None, size: int) -> None:
     check_name("video codec", video, CODECS)
     if video == "h264" and size % 2:
         raise InputError(
-            f"size is {size}, and a video of h264 needs an even one; render at {size + 1}, take "
-            "av1, or leave the images lossless."
+            f"size is {size}, and an h264 video needs an even size; render at {size + 1}, use "
+            "av1, or keep the images lossless."
         )
     if video == "av1" and size < AV1_SIZE:
         raise InputError(
-            f"size is {size}, and a video of av1 needs at least {AV1_SIZE}; render larger, take "
-            "h264, or leave the images lossless."
+            f"size is {size}, and an av1 video needs at least {AV1_SIZE}; render larger images, "
+            "use h264, or keep the images lossless."
         )
 
 

@@ -46,7 +46,8 @@ def export_features(
     for entry in rows:
         if len(entry) != dataset.length:
             raise InputError(
-                f"{len(entry)} features of {dataset.length} frames; encode this dataset."
+                f"There are {len(entry)} features, but the dataset has {dataset.length} "
+                "frames; encode this dataset."
             )
     width = sum(entry.shape[1] for entry in rows)
     features = schema.features((), dataset.image_size, depth=False, segmentation=False)

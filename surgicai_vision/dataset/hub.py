@@ -40,7 +40,7 @@ def dataset_card(dataset: RenderedDataset, repo: str, licence: str = LICENCE) ->
     images = dataset.image_keys
     size = f"{dataset.image_size} × {dataset.image_size}"
     lost = "".join(
-        f" The video of `{view}` is off by {error:.2f} of 255 on average."
+        f" The video of `{view}` differs from the images by {error:.2f} of 255 on average."
         for view, error in meta.get("video_error", {}).items()
     )
     stored = f"as {dataset.video} video.{lost}" if dataset.video else "lossless."
@@ -48,7 +48,8 @@ def dataset_card(dataset: RenderedDataset, repo: str, licence: str = LICENCE) ->
     looks = ""
     if dataset.variants > 1:
         looks = (
-            f" Every {dataset.variants} episodes in a row show one demonstration, each in its look."
+            f" Every {dataset.variants} consecutive episodes show one demonstration, each "
+            "with its own look."
         )
     shown = "\n".join(f"| `{key}` | {size} |" for key in images)
     return f"""---

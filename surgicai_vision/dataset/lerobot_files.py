@@ -53,8 +53,8 @@ class LeRobotFiles:
         self.path = Path(path)
         if not (self.path / INFO).is_file():
             raise BadFile(
-                f"{self.path} is no LeRobot dataset: it has no {INFO}, without which nothing can "
-                "be read."
+                f"{self.path} is not a LeRobot dataset: it has no {INFO}, without which nothing "
+                "can be read."
             )
         self.info = read_json(self.path / INFO)
         self.problems: list[str] = []
@@ -69,11 +69,11 @@ class LeRobotFiles:
             version = self.info["codebase_version"]
         except (KeyError, TypeError, ValueError, AttributeError, pa.ArrowException) as error:
             raise BadFile(
-                f"{self.path / INFO} is not that of a LeRobot dataset ({first_line(error)})."
+                f"{self.path / INFO} does not describe a LeRobot dataset ({first_line(error)})."
             ) from None
         if version not in VERSIONS or not self.fps > 0:
             raise BadFile(
-                f"{self.path / INFO}: version {version!r}, {self.fps:g} fps; read: "
+                f"{self.path / INFO}: version {version!r}, {self.fps:g} fps; supported versions: "
                 f"{', '.join(VERSIONS)}."
             )
         self.tasks = self._read_tasks()
@@ -124,7 +124,7 @@ class LeRobotFiles:
         for number, row in enumerate(rows):
             if row.get("episode_index") != number:
                 self.problems.append(
-                    f"meta/episodes: row {number} is of episode {row.get('episode_index')}."
+                    f"meta/episodes: row {number} belongs to episode {row.get('episode_index')}."
                 )
                 return rows[:number]
         return rows

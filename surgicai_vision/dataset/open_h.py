@@ -155,7 +155,8 @@ class OpenHLayout:
             raise InputError(
                 f"frame_stride is {frame_stride} and action_repeat {config.action_repeat}: an "
                 f"action of layout 'open-h' would be held for {held} control steps; allowed: at "
-                f"most {ACTION_REPEAT_LIMIT}. Give a smaller frame_stride, or our own layout."
+                f"most {ACTION_REPEAT_LIMIT}. Give a smaller frame_stride, or use "
+                "surgicai-vision's own layout."
             )
         return dataclasses.replace(config, action_repeat=held)
 

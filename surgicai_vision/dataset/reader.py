@@ -259,7 +259,7 @@ class RenderedDataset:
             values = np.asarray(column)
         if values.dtype.kind not in "biuf" or len(values) != self.length:
             raise BadFile(
-                f"{self.path}: column {key} holds {column.type} or less than a number a frame."
+                f"{self.path}: column {key} holds {column.type} or fewer than one number per frame."
             )
         return values
 
@@ -270,7 +270,7 @@ class RenderedDataset:
         stop = self.length if stop is None else stop
         if not 0 <= start <= stop <= self.length:
             raise InputError(
-                f"frames {start} to {stop} were asked; the dataset has 0 to {self.length}."
+                f"frames {start} to {stop} were requested; the dataset has 0 to {self.length}."
             )
         channels = 1 if np.dtype(dtype).kind == "f" else 3
         shape = (stop - start, self.image_size, self.image_size, channels)
@@ -329,8 +329,8 @@ def _read_meta(path: Path) -> schema.Table:
         )
     if "layout" in meta:
         raise BadFile(
-            f"{path} has the layout '{meta['layout']}' of others, which lerobot-train and "
-            "LeRobot's tools read; for this command render the demonstrations without --layout."
+            f"{path} has the third-party layout '{meta['layout']}', which lerobot-train and "
+            "LeRobot's tools read; for this command, render the demonstrations without --layout."
         )
     return meta
 

@@ -185,8 +185,9 @@ def _check_layout(layout: str, frame_stride: int, video: str | None) -> None:
         return
     if video:
         raise InputError(
-            f"--video {video} is of our own layout; render --layout {layout} as images and make "
-            "videos of them with 'lerobot-edit-dataset --operation.type convert_image_to_video'."
+            f"--video {video} works only with surgicai-vision's own layout; render --layout "
+            f"{layout} as images and convert them to videos with 'lerobot-edit-dataset "
+            "--operation.type convert_image_to_video'."
         )
     if frame_stride > ACTION_REPEAT_LIMIT:
         raise InputError(
@@ -215,7 +216,7 @@ def _same_config(origins: Sequence[_Origin], paths: Sequence[Path]) -> TaskConfi
     first = origins[0]
     for path, origin in zip(paths, origins, strict=True):
         if origin.config != first.config or origin.scene_hash != first.scene_hash:
-            raise BadFile(f"{path} was made with another task or scene than {paths[0]}.")
+            raise BadFile(f"{path} was not made with the same task and scene as {paths[0]}.")
     return first.config
 
 

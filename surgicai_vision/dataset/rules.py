@@ -29,7 +29,7 @@ def episode_problems(
     if not np.allclose(columns["timestamp"], steps / fps, atol=1e-4):
         yield f"episode {number}: timestamp is not frame_index / {fps:g}."
     if not np.array_equal(columns[names.DONE], steps == count - 1):
-        yield f"episode {number}: {names.DONE} is not true at its last frame alone."
+        yield f"episode {number}: {names.DONE} is not true at exactly its last frame."
     if len(np.unique(columns[names.SEED])) != 1:
         yield f"episode {number}: its frames have different seeds."
 
@@ -82,7 +82,7 @@ class ImageWatch:
         problem = image_problem(frame, self._size)
         if self._before is not None and np.array_equal(frame, self._before):
             if self._watched and np.abs(self._shown[index] - self._last).max() > MOVED:
-                problem = problem or "the image before it again, although something moved"
+                problem = problem or "identical to the previous image, although something moved"
         else:
             self._before = frame
             self._last = self._shown[index]
@@ -97,5 +97,5 @@ def image_problem(frame: NDArray[np.uint8 | np.float32], size: int) -> str:
         return "depth that is not finite and positive"
     highest = frame.max()
     if frame.min() == highest:
-        return "black" if highest == 0 else "of one colour"
+        return "black" if highest == 0 else "a single colour"
     return ""

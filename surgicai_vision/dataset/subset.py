@@ -39,7 +39,9 @@ def first_episodes(dataset: Dataset, count: int) -> "DatasetSubset":
     """
     bounds = episode_bounds(dataset.demonstration_index)
     if not 1 <= count <= len(bounds):
-        raise InputError(f"{count} demonstrations were asked; {dataset.path} holds {len(bounds)}.")
+        raise InputError(
+            f"{count} demonstrations were requested; {dataset.path} holds {len(bounds)}."
+        )
     return DatasetSubset(dataset, np.arange(bounds[count - 1][1]), {"episodes": count})
 
 
@@ -59,7 +61,7 @@ def with_frame_stride(dataset: Dataset, frame_stride: int) -> Dataset:
     held = names.FPS // dataset.fps
     if frame_stride % held:
         raise InputError(
-            f"The recipe takes a frame every {frame_stride} steps; the dataset holds one every "
+            f"The recipe uses a frame every {frame_stride} steps; the dataset holds one every "
             f"{held} ('render-demos --frame-stride {held}'). Give a recipe with frame_stride: "
             f"{held}, or render all frames."
         )
@@ -198,7 +200,7 @@ class DatasetSubset:
         if not 0 <= start <= stop <= self.length:
             selection = ", ".join(f"{key} {value}" for key, value in self._selection.items())
             raise InputError(
-                f"frames {start} to {stop} were asked; this subset ({selection}) has 0 to "
+                f"frames {start} to {stop} were requested; this subset ({selection}) has 0 to "
                 f"{self.length}."
             )
         rows = self.rows[start:stop]

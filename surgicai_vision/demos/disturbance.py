@@ -118,6 +118,7 @@ def check_late(demonstrator: str, disturbance: Disturbance) -> None:
     """
     if disturbance.late and demonstrator not in RETURNING_DEMONSTRATORS:
         raise InputError(
-            f"late is {disturbance.late}, and demonstrator '{demonstrator}' goes back to nothing; "
-            f"leave it out or take demonstrator {', '.join(RETURNING_DEMONSTRATORS)}."
+            f"late is {disturbance.late}, but demonstrator '{demonstrator}' never goes back to "
+            "an earlier subtask; leave late out or use demonstrator "
+            f"{', '.join(RETURNING_DEMONSTRATORS)}."
         )

@@ -100,8 +100,8 @@ class Expert(Demonstrator):
     ):
         if noise < 0.0 or (noise and rng is None):
             raise InputError(
-                f"Expert got noise {noise} and rng {rng}; "
-                "noise is at least 0 and comes from a Generator."
+                f"Expert got noise {noise} and rng {rng}; noise must be at least 0 and needs a "
+                "Generator."
             )
         self.env = env
         self.noise = noise
@@ -417,7 +417,7 @@ def _rule(subtask: Subtask) -> Callable[[WorldState], ToolTarget]:
     if not subtask.expert:
         raise InputError(
             f"The task '{subtask.name}' has no expert; its author must name one "
-            '(`expert = "module:function"`), or take demonstrations of another kind.'
+            '(`expert = "module:function"`), or use demonstrations of another kind.'
         )
     rule: Callable[[WorldState], ToolTarget] = resolve(subtask.expert)
     return rule

@@ -231,14 +231,14 @@ def _check_demos(demonstrator: str, demos: Sequence[Path], source: str) -> None:
     if demos and demonstrator not in LEARNING_DEMONSTRATORS:
         learning = ", ".join(sorted(LEARNING_DEMONSTRATORS))
         raise InputError(
-            f"Demonstrator '{demonstrator}' learns from no demonstrations; "
-            f"leave them (--from) out or take demonstrator {learning}."
+            f"Demonstrator '{demonstrator}' does not learn from demonstrations; leave them "
+            f"(--from) out or use demonstrator {learning}."
         )
     if source and demonstrator not in CHOOSING_DEMONSTRATORS:
         choosing = ", ".join(sorted(CHOOSING_DEMONSTRATORS))
         raise InputError(
-            f"source is '{source}', and demonstrator '{demonstrator}' chooses no demonstration; "
-            f"leave it out or take demonstrator {choosing}."
+            f"source is '{source}', but demonstrator '{demonstrator}' does not choose a "
+            f"demonstration; leave source out or use demonstrator {choosing}."
         )
 
 
@@ -304,8 +304,8 @@ def _run_seeds(
             reasons = "; ".join(f"seed {row['seed']}: {row['reason']}" for row in skipped[:3])
             raise SurgicaiError(
                 f"The {request['demonstrator']} succeeded at {len(kept)} of "
-                f"{len(kept) + len(skipped)} starts of {request['task']['task']}; "
-                f"{wanted} were wanted ({reasons}; …)."
+                f"{len(kept) + len(skipped)} starts of {request['task']['task']}; {wanted} were "
+                f"requested ({reasons}; …)."
             )
         # As many seeds as there are missing episodes; failed ones are replaced in the next round.
         jobs = [

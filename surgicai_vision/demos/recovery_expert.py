@@ -106,7 +106,7 @@ class RecoveryExpert(Demonstrator):
             )
         if env.config.advance != "success":
             raise InputError(
-                f"Demonstrator 'recover' goes on where the env does; advance is "
+                "Demonstrator 'recover' needs an env that advances at each success; advance is "
                 f"'{env.config.advance}'. Leave env.advance out."
             )
         self._env = env
@@ -127,7 +127,7 @@ class RecoveryExpert(Demonstrator):
     def gives_up(self) -> str:
         """Return why no rule leads any further, or ""."""
         if self._steps > PATIENCE:
-            return f"no way on from {names.SUBTASKS[self._env.phase]} in {PATIENCE} steps"
+            return f"no progress beyond {names.SUBTASKS[self._env.phase]} in {PATIENCE} steps"
         if self._env.phase == PULLOUT and self._env.simulation.task_state.holes_passed < 2:
             return "the needle slid back out of the exit in the pull-out"
         return ""

@@ -242,7 +242,7 @@ def list_demos(folder: Path) -> list[Path]:
         raise BadFile(f"{folder} holds no episodes.")
     for index, path in enumerate(paths):
         if path.name != f"episode_{index:06d}.safetensors":
-            raise BadFile(f"{folder}: episode {index} is missing (found {path.name} in its place).")
+            raise BadFile(f"{folder}: episode {index} is missing (found {path.name} instead).")
     return paths
 
 

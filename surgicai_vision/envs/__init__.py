@@ -129,6 +129,6 @@ def refuse_max_steps(arguments: Mapping[str, object]) -> None:
     """Raise `InputError` if `max_steps` is given: two arguments would limit an episode."""
     if "max_steps" in arguments:
         raise InputError(
-            f"max_steps is {arguments['max_steps']}; of a gymnasium id the limit of an episode is "
-            f"gymnasium's own argument: max_episode_steps={arguments['max_steps']}."
+            f"max_steps is {arguments['max_steps']}; for a gymnasium id, the limit of an episode "
+            f"is gymnasium's own argument: max_episode_steps={arguments['max_steps']}."
         )

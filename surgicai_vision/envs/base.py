@@ -502,8 +502,8 @@ class SuturingEnv(gymnasium.Env):
         def frame(view: str, modality: str) -> Frame:
             if self._moves != moves:
                 raise InputError(
-                    f"'{view}' of an observation is looked at for the first time after the env has "
-                    "moved on; look at it before the next step."
+                    f"The image '{view}' of an observation is read for the first time after the "
+                    "env has moved on; read it before the next step."
                 )
             return self.image(view, self.view.image_size, modality)
 
@@ -619,7 +619,7 @@ def _given(
         )
     if given and not axes.on:
         raise InputError(
-            "options['randomisation'] gives numbers, and this env has no randomisation; make it "
+            "options['randomisation'] gives numbers, but this env has no randomisation; make it "
             f"with one, such as randomisation={{'{next(iter(given))}': …}}."
         )
     # The latency is reported as well, but is fixed by the env.
@@ -631,8 +631,8 @@ def _refuse_increments(config: TaskConfig) -> None:
     if config.hold_jaw or config.randomisation.latency:
         given = "hold_jaw" if config.hold_jaw else "latency"
         raise InputError(
-            f"{given} changes increments, and in action mode 'absolute' an action is the set-point "
-            "of both arms; leave it out."
+            f"{given} changes increments, but in action mode 'absolute' an action is the "
+            "set-point of both arms; leave it out."
         )
 
 

@@ -72,7 +72,7 @@ class EpisodeMonitor:
 
     def update(self, info: Info) -> None:
         """Read the state that a step ended in; `info` is that step's."""
-        assert self._watch is not None, "reset() begins an episode"
+        assert self._watch is not None, "call reset() first"
         simulation = self._env.simulation
         slip, turn = info["needle_slip"]
         self.slip = max(self.slip, float(slip))

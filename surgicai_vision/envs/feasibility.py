@@ -107,8 +107,7 @@ def _refuse_narrow(config: TaskConfig) -> None:
             raise InputError(
                 f"randomisation: a needle of {arc} circle makes '{config.task}' impossible in "
                 f"layout '{layout}': when its base leaves the exit of pair {index + 1}, its tip "
-                "has come round to the flank. Allowed: a shorter needle_arc, or a smaller "
-                "needle_size."
+                "has reached the flank. Allowed: a shorter needle_arc, or a smaller needle_size."
             )
         allowed = largest_size(pair, TIP_ANGLES[arc])
         why = (
@@ -122,7 +121,7 @@ def _refuse_narrow(config: TaskConfig) -> None:
             )
             raise InputError(
                 f"randomisation: needle_size {axes.needle_size} makes '{config.task}' impossible "
-                f"in layout '{layout}': {why}, an arc of {arc} circle, when it is smallest: PSM2's "
+                f"in layout '{layout}': {why}, an arc of {arc} circle, at its smallest: PSM2's "
                 "jaws would meet the entry (see surgicai_vision.envs.geometry). The largest "
                 f"needle_size here is {max(limit, 0.0)}."
             )

@@ -168,7 +168,7 @@ def _checked(axis: str, numbers: object) -> list[float]:
         )
     if len(given) != _SIZES[axis]:
         raise InputError(
-            f"randomisation: {axis} has {_SIZES[axis]} numbers; {len(given)} are given."
+            f"randomisation: {axis} takes {_SIZES[axis]} numbers; {len(given)} are given."
         )
     least, most = _BOUNDS[axis]
     beyond = np.flatnonzero((given < least - ROUNDING) | (given > most + ROUNDING))

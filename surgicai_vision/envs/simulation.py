@@ -152,7 +152,7 @@ class Simulation:
         """
         if not self._own:
             raise InputError(
-                "The state is of a randomised episode; make the env with its randomisation."
+                "The state is from a randomised episode; make the env with the same randomisation."
             )
         randomisation.apply(self.scene, self.model, draws)
         self.draws = draws

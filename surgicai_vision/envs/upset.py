@@ -94,7 +94,9 @@ class UpsetPlan:
 def check_upset_task(task: str) -> None:
     """Raise `InputError` unless something can go wrong in a task."""
     if task not in TASK_KINDS:
-        raise InputError(f"Nothing upsets '{task}'; upsets are for {', '.join(TASK_KINDS)}.")
+        raise InputError(
+            f"Task '{task}' has no upsets; tasks with upsets: {', '.join(TASK_KINDS)}."
+        )
 
 
 def plan_upset(seed: int, task: str, fraction: float = 1.0) -> UpsetPlan | None:

@@ -165,8 +165,8 @@ class HierarchicalAgent(Agent):
         self._ends: _Ends = _LearnedEnds(config) if learned else _PrivilegedEnds(config.grasp_hold)
         if any(agent.action_mode != names.INCREMENTS for agent in self._low):
             raise InputError(
-                "A low-level policy moves the active arm by increments, and one of these says "
-                "set-points of both arms; evaluate it by itself."
+                "A low-level policy moves the active arm by increments, but one of these gives "
+                "set-points of both arms; evaluate that one by itself."
             )
         self._agents = [*self._low, *([self._high] if self._high else [])]
         self.privileged = not learned or any(agent.privileged for agent in self._agents)
@@ -175,7 +175,8 @@ class HierarchicalAgent(Agent):
         sizes = {agent.image_size for agent in self._agents if agent.cameras}
         if len(sizes) > 1:
             raise InputError(
-                f"The policies see images of {sorted(sizes)} pixels; give policies of one size."
+                f"The policies see images of {sorted(sizes)} pixels; give policies with one image "
+                "size."
             )
         if sizes:
             self.image_size = sizes.pop()

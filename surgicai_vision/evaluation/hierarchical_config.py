@@ -83,7 +83,7 @@ class HierarchicalConfig:
         if not 1 <= self.grasp_hold <= DWELL:
             raise InputError(f"grasp_hold is {self.grasp_hold}; allowed: 1 to {DWELL}.")
         if not 0.0 <= self.confidence < 1.0:
-            raise InputError(f"confidence is {self.confidence}; allowed: 0 to below 1.")
+            raise InputError(f"confidence is {self.confidence}; allowed: at least 0 and below 1.")
         if self.hlp == ORDER and self.termination == "learned":
             raise InputError(
                 "A learned termination needs a high-level policy; give hlp: a checkpoint folder, "

@@ -203,12 +203,12 @@ def _circumstances(
     elif task:
         config = TaskConfig(task=task)
     else:
-        raise InputError(f"{folder} does not say what it was trained for; give --task.")
+        raise InputError(f"{folder} does not name the task it was trained for; give --task.")
     seen = policy.get("input_features") or {}
     action_mode = _action_mode(folder, seen, policy.get("output_features") or {})
     if action_mode == names.ABSOLUTE and (config.hold_jaw or config.randomisation.latency):
         raise InputError(
-            f"{folder} says both arms' set-points, and its env changes increments (hold_jaw or "
+            f"{folder} gives both arms' set-points, but its env changes increments (hold_jaw or "
             "latency); train it in an env without."
         )
     inputs = _inputs(folder, seen, features)
@@ -248,7 +248,7 @@ def _inputs(folder: Path, seen: Mapping[str, Any], features: Mapping[str, Any]) 
         if not features:
             raise InputError(
                 f"{folder} sees {names.ENVIRONMENT_STATE}, and neither its env nor its dataset "
-                "says of which encoder; train it on an exported dataset of ours."
+                "names its encoder; train it on an exported dataset of ours."
             )
         return Inputs(
             tuple(features["views"]),
@@ -277,7 +277,7 @@ def _table(path: Path) -> dict[str, Any]:
     """Return a JSON table."""
     content = read_json(path)
     if not isinstance(content, dict) or (path.name == CONFIG and not content.get("type")):
-        raise BadFile(f"{path} is no configuration of LeRobot.")
+        raise BadFile(f"{path} is not a LeRobot configuration.")
     if path.name == CONFIG:
         _check_features(path, content)
     return content
@@ -308,7 +308,7 @@ def _part(path: Path, table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     """Return a table within a table of the file `path`; empty where there is none."""
     part = table.get(key) or {}
     if not isinstance(part, dict):
-        raise BadFile(f"{path} is damaged: '{key}' is no table; copy it again.")
+        raise BadFile(f"{path} is damaged: '{key}' is not a table; copy it again.")
     return part
 
 
@@ -461,6 +461,6 @@ def _encoder(inputs: Inputs, weights: WeightsSource) -> "Encoder":
     if inputs.sha256 and encoder.weights_sha256 != inputs.sha256:
         raise InputError(
             f"The policy was trained on encoder '{inputs.encoder}' with weights sha256 "
-            f"{inputs.sha256}, got {encoder.weights_sha256}; hand over the same with --weights."
+            f"{inputs.sha256}, got {encoder.weights_sha256}; give the same weights with --weights."
         )
     return encoder

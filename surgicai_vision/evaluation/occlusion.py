@@ -163,10 +163,12 @@ def _check(agent: Agent, config: TaskConfig, steps: Sequence[int], patch: int) -
             f"{agent.name} does the whole procedure; give the policy of one subtask and --task."
         )
     if not steps or min(steps) < 0:
-        raise InputError(f"steps are {', '.join(map(str, steps)) or 'none'}; give some, from 0.")
+        raise InputError(
+            f"steps are {', '.join(map(str, steps)) or 'none'}; give at least one, from 0."
+        )
     if not 2 <= patch <= agent.image_size:
         raise InputError(
-            f"patch is {patch}; it must be within 2 and the image's side, {agent.image_size} px."
+            f"patch is {patch}; it must be between 2 and the image's side, {agent.image_size} px."
         )
 
 

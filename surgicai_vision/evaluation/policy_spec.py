@@ -219,7 +219,7 @@ def in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
     if not env:
         return spec
     if "task" in env:
-        raise InputError("env: the task is an option of its own; write `task:` beside `env:`.")
+        raise InputError("env: the task is a separate option; write `task:` next to `env:`.")
     limit: dict[str, JSON] = {}
     if spec.run.is_hierarchical:
         if "advance" in env:
@@ -239,8 +239,8 @@ def _replay(dataset: "Dataset") -> PolicySpec:
     """
     if dataset.fps != names.FPS:
         raise InputError(
-            f"{dataset.path} holds {dataset.fps} frames a second; "
-            f"a replay needs each step's: {names.FPS}."
+            f"{dataset.path} holds {dataset.fps} frames per second; "
+            f"a replay needs one for each step: {names.FPS}."
         )
     actions = mean_demonstration(dataset.columns()[names.ACTION], dataset.episode_index)
     run = RunConfig(dataset.config, policy=REPLAY)
@@ -265,7 +265,7 @@ def make_from_factory(target: str) -> Agent:
     """
     module, _, name = target.partition(":")
     if not name or not all(module.split(".")):
-        raise InputError(f"{target} names no function of a module; give module:factory.")
+        raise InputError(f"{target} is not a function in a module; give module:factory.")
     try:
         factory = resolve(target)
     except (ImportError, AttributeError) as error:
@@ -280,7 +280,7 @@ def make_from_factory(target: str) -> Agent:
         raise _failed(target, error) from error
     if not isinstance(agent, Agent):
         raise InputError(
-            f"{target} gives {type(agent).__name__}; "
+            f"{target} returns {type(agent).__name__}; "
             "it must be a function that returns a surgicai_vision.evaluation.agent.Agent."
         )
     return agent
@@ -450,8 +450,8 @@ def hierarchical_policy(
     for subtask, policy in config.low.items():
         if _names_code(policy):
             raise InputError(
-                f"{subtask}: {policy} names code, which a file may not; give a checkpoint or a "
-                f"baseline ({', '.join(BASELINES)})."
+                f"{subtask}: {policy} names code, which is not allowed in a file; give "
+                f"a checkpoint or a baseline ({', '.join(BASELINES)})."
             )
         spec = open_policy(policy, task=subtask, weights=weights)
         low[subtask] = spec.make_agent

@@ -36,7 +36,7 @@ def check_seeds(seeds: Sequence[int]) -> None:
     ends = (seeds[0], seeds[-1]) if isinstance(seeds, range) and seeds else seeds
     if any(not 0 <= seed <= LARGEST_INTEGER for seed in ends):
         raise InputError(
-            f"Start seeds reach from {min(ends)} to {max(ends)}; allowed: 0 to {LARGEST_INTEGER}. "
+            f"Start seeds range from {min(ends)} to {max(ends)}; allowed: 0 to {LARGEST_INTEGER}. "
             "Give another --seed, or fewer episodes."
         )
     if not seeds or len(set(seeds)) != len(seeds):

@@ -98,7 +98,7 @@ class Slot:
     def __post_init__(self) -> None:
         if self.upset and self.agent.action_mode != names.INCREMENTS:
             raise InputError(
-                f"{self.agent.name} says set-points of both arms, which an upset cannot alter; "
+                f"{self.agent.name} gives set-points of both arms, which an upset cannot alter; "
                 "leave --upset out."
             )
         self.env = env_of(self.agent, self.task_config)

@@ -76,7 +76,7 @@ def read_versioned(path: Path) -> Row:
     if found != FORMAT:
         raise BadFile(
             f"{path} has format {found!r}, of another version (0.1 wrote none); "
-            f"this one reads {FORMAT}. Make it again."
+            f"this version reads {FORMAT}. Make it again."
         )
     table: Row = stored
     return table

@@ -95,13 +95,13 @@ class Demonstrations:
             choosing = ", ".join(sorted(CHOOSING_DEMONSTRATORS))
             raise InputError(
                 f"demonstrations {self.name}: demonstrator is '{self.demonstrator}' and of is "
-                f"'{self.of}'; with demonstrator {choosing}, and with no other, name the "
-                "demonstrations that are re-posed (of: NAME)."
+                f"'{self.of}'; with demonstrator {choosing}, and with no other, give "
+                "of: NAME, the demonstrations to re-pose."
             )
         if self.of and self.learner:
             raise InputError(
-                f"demonstrations {self.name}: '{self.learner}' acts in what is re-posed of "
-                f"'{self.of}'; leave out learner or of."
+                f"demonstrations {self.name}: learner '{self.learner}' cannot act in what is "
+                f"re-posed from '{self.of}'; leave out learner or of."
             )
         _ = self.looks  # refuses variants that cannot be drawn
 
@@ -136,7 +136,7 @@ class Demonstrations:
         parts += [f"a frame every {self.frame_stride} steps"] if self.frame_stride > 1 else []
         parts += [f"with the visits in '{self.visits_of}'"] if self.visits_of else []
         if self.learner:
-            parts.append(f"'{self.learner}' acting at first, beside what that was trained on")
+            parts.append(f"'{self.learner}' acting at first, added to what that was trained on")
         parts += [f"each in {self.looks.text}"] if self.looks else []
         return ", ".join(parts)
 
@@ -180,6 +180,6 @@ def first_seed(training_seed: int) -> int:
     if not 0 <= training_seed < TRAINING_SEEDS:
         raise InputError(
             f"seed is {training_seed}; allowed: 0 to {TRAINING_SEEDS - 1}, the training seeds that "
-            "have demonstrations of their own."
+            "have their own demonstrations."
         )
     return names.TRAIN_SEED + SEEDS_EACH * training_seed

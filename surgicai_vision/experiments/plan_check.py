@@ -57,7 +57,7 @@ def check_plan(plan: "Plan") -> None:
     if len(set(plan.runs)) != len(plan.runs):
         raise InputError(
             f"The plan has {len(plan.runs)} runs, {len(set(plan.runs))} of them different; "
-            "leave out policies that differ in nothing but their names."
+            "leave out policies that differ only in their names."
         )
 
 
@@ -86,7 +86,7 @@ def _check_looks(plan: "Plan", recorded: Demonstrations) -> None:
     if recorded.view and shown.randomisation.shows_heldout:
         raise InputError(
             f"demonstrations {recorded.name} would show looks that are held out for tests "
-            f"({', '.join(names.HELDOUT_APPEARANCES)}); take appearance: {names.TRAIN}, and no "
+            f"({', '.join(names.HELDOUT_APPEARANCES)}); use appearance: {names.TRAIN} and no "
             "appearance_shift; a condition may show them."
         )
 
@@ -119,7 +119,7 @@ def _check_learner(plan: "Plan", recorded: Demonstrations) -> None:
             raise InputError(
                 f"demonstrations {recorded.name}: its learner '{recorded.learner}' is trained on "
                 f"'{learned.name}', which is recorded with that learner; give one that is "
-                "trained before."
+                "trained earlier."
             )
         behind.append(learned.name)
         learner = learned.learner
@@ -128,7 +128,7 @@ def _check_learner(plan: "Plan", recorded: Demonstrations) -> None:
     first = plan.dataset(recorded, plan.seed[0])
     if first.next_seed > first_seed(plan.seed[0]) + SEEDS_EACH:
         raise InputError(
-            f"demonstrations {recorded.name}: with those that its learner was trained on they try "
+            f"demonstrations {recorded.name}: with those that its learner was trained on, they try "
             f"more than the {SEEDS_EACH} starts of a training seed; record fewer episodes."
         )
 

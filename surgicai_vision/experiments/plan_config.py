@@ -466,7 +466,7 @@ class Plan:
         views = ", ".join(view for view in view_names() if view in seen) or "no images"
         seeds = ", ".join(map(str, self.seed))
         return (
-            f"for each training seed ({seeds}) of its own: {recorded}; {views} at {self.size} × "
+            f"for each training seed ({seeds}) its own {recorded}; {views} at {self.size} × "
             f"{self.size}; recipe {self.recipe}; {self.episodes} {self.starts} starts from "
             f"{BANKS[self.starts]}"
         )

@@ -95,15 +95,15 @@ def _first_act(
     """Sew and film a procedure, and announce what comes next; return the result."""
     say(f"Act 1. A whole procedure by {sewer.who}.")
     if sewer.why:
-        say(f"  In the place of {plan.procedure}, which cannot: {sewer.why}")
+        say(f"  Instead of {plan.procedure}, which cannot be used: {sewer.why}")
     with timed(context.stage, state["seconds"]) as measured:
         sewn = sew(sewer, out / PROCEDURE, say, measured)
     state["video"] = _video(sewn)
     _store_state(out, state)
     say("")
     say(
-        f"Act 2. A policy of {plan.task}, from demonstrations to counted successes, and what "
-        "it is to be compared with."
+        f"Act 2. A policy for {plan.task}, from demonstrations to measured successes, and what to "
+        "compare it with."
     )
     return sewn
 
@@ -167,8 +167,8 @@ def _finding(plan: Quickstart, results: Sequence[Row]) -> dict[str, str]:
         "headline": f"{plan.task.capitalize()}, {_words(run)}: {shown['successes']} of "
         f"{shown['episodes']} held-out starts" + (f"; {beside}" if beside else ""),
         "lead": f"Trained on {plan.demonstrations} demonstrations{_seen(run)}; 95 % interval "
-        f"{interval(shown['ci95'])}. Beside it, from the same demonstrations and on the "
-        f"same starts: {details}.",
+        f"{interval(shown['ci95'])}. For comparison, from the same demonstrations and on "
+        f"the same starts: {details}.",
     }
 
 

@@ -61,10 +61,10 @@ class Quickstart:
 
     def __post_init__(self) -> None:
         if not self.policies:
-            raise InputError("policies is empty; give at least one; {} is one without images.")
+            raise InputError("policies is empty; give at least one; {} is a policy without images.")
         check_frame_stride(self.frame_stride)
         if not 0.0 <= self.noise <= 1.0:
-            raise InputError(f"noise is {self.noise:g}; it must be within 0 and 1.")
+            raise InputError(f"noise is {self.noise:g}; it must be between 0 and 1.")
         for run in self.runs:
             if run.encoder:
                 encoders.check_encoder_name(run.encoder)

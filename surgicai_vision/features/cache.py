@@ -225,7 +225,7 @@ def _read_manifest(folder: Path) -> Manifest:
         checked(stored.get(key), kind, f"{MANIFEST}: {key}")
     sides = [checked(side, int, f"{MANIFEST}: shape") for side in stored["shape"]]
     if stored["length"] < 1 or min(sides, default=0) < 1 or math.prod(sides) != stored["dim"]:
-        raise BadFile(f"{MANIFEST}: its length, shape and dim are those of no features")
+        raise BadFile(f"{MANIFEST}: its length, shape and dim cannot be those of features")
     manifest: Manifest = stored  # type: ignore[assignment]  # what is read of it was checked
     return manifest
 

@@ -40,7 +40,7 @@ def find_device(name: str) -> str:
     if torch.cuda.is_available():
         return CUDA
     if name == CUDA:
-        raise InputError("--device cuda: torch finds no CUDA device; take cpu or auto.")
+        raise InputError("--device cuda: torch finds no CUDA device; use cpu or auto.")
     return CPU
 
 

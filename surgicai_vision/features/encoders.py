@@ -213,7 +213,7 @@ def load_encoder(
     if pool == "global" and encoder.shape != (card.dim,):
         raise ENCODERS.refusal(
             name,
-            f"gives features of shape {encoder.shape}, and its card says dim {card.dim}; its "
+            f"gives features of shape {encoder.shape}, but its card says dim {card.dim}; its "
             "author must correct one of them",
         )
     return encoder

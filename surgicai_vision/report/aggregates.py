@@ -44,7 +44,7 @@ def probability_of_improvement(first: Scores, second: Scores) -> float:
         InputError: the two differ in their number of tasks.
     """
     if len(first) != len(second):
-        raise InputError(f"{len(first)} tasks beside {len(second)}; give the same tasks of both.")
+        raise InputError(f"{len(first)} tasks against {len(second)}; give the same tasks for both.")
     shares = []
     for mine, theirs in zip(_checked(first), _checked(second), strict=True):
         difference = np.subtract.outer(np.asarray(mine), np.asarray(theirs))
@@ -81,5 +81,5 @@ def bootstrap(
 
 def _checked(scores: Scores) -> Scores:
     if not len(scores) or any(not len(task) for task in scores):
-        raise InputError("There is a task without runs; give at least one run of each.")
+        raise InputError("A task has no runs; give at least one run of each task.")
     return scores

@@ -213,7 +213,7 @@ def procedure(groups: Sequence[Group]) -> Chart | None:
     drawn = lines[:MOST]
     ticks = {float(index + 1): name for index, name in enumerate(names.SUBTASKS)}
     drawing = charts.curves(
-        drawn, "finished, and all before it", label="progress in the procedure", ticks=ticks
+        drawn, "finished, with all before it", label="progress in the procedure", ticks=ticks
     )
     more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
     key = charts.key(drawn)

@@ -51,7 +51,7 @@ def markdown(groups: Sequence[Group], title: str) -> str:
     rows = beside_paper(groups)
     if rows:
         parts += [
-            f"Success beside the paper's ({paper.SOURCE}); ours: k/n and exact 95 % interval.",
+            f"Success next to the paper's ({paper.SOURCE}); ours: k/n and exact 95 % interval.",
             "",
         ]
         parts += _markdown(
@@ -86,7 +86,7 @@ def latex(groups: Sequence[Group], title: str) -> str:
         head = ["& & " + spans, r"\cmidrule(lr){3-4}\cmidrule(lr){5-6}"]
         head.append(_latex_row(("task", "encoder", "paper", "ours", "paper", "ours")))
         caption = (
-            f"Success rates beside those of {paper.SOURCE}; ours: k/n and exact 95 % interval."
+            f"Success rates next to those of {paper.SOURCE}; ours: k/n and exact 95 % interval."
         )
         parts += _latex_table("llrrrr", head, body, caption, "tab:paper")
     body = [_record(item) for item in groups]

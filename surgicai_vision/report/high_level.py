@@ -56,7 +56,7 @@ def _shown(results: list[Result]) -> HighLevel:
     errors = from_mapping(StageErrors, first.high_level["stage_errors"], str(first.folder))
     labels = dict.fromkeys(f"{one.condition.policy}, seed {one.seed}" for one in results)
     said = [
-        f"{errors.right} of {text.plural(errors.frames, 'frame')} named rightly "
+        f"{errors.right} of {text.plural(errors.frames, 'frame')} predicted correctly "
         f"({percentages.percent(errors.right / errors.frames)})",
         f"calibration error {errors.calibration_error:.3f}",
     ]

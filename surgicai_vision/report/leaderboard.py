@@ -114,7 +114,7 @@ class Row:
 
     def __post_init__(self) -> None:
         if not all(isinstance(version, str | None) for version in self.versions.values()):
-            raise InputError("versions must be texts: package → its version.")
+            raise InputError("versions must be texts: package → version.")
 
     @property
     def condition(self) -> str:
@@ -165,7 +165,7 @@ def make_row(folder: Path, entry: Entry) -> Row:
     ).sealed()
     wrong = problem(row)
     if wrong:
-        raise InputError(f"{folder} makes no row: {wrong}")
+        raise InputError(f"{folder} cannot become a row: {wrong}")
     return row
 
 
@@ -177,12 +177,12 @@ def read_row(path: Path) -> Row:
     """
     try:
         if not path.is_file():
-            raise BadFile(f"{path} is no file.")
+            raise BadFile(f"{path} is not a file.")
         if path.stat().st_size > LARGEST:
-            raise BadFile(f"{path} is larger than {LARGEST} bytes; a row has some kilobytes.")
+            raise BadFile(f"{path} is larger than {LARGEST} bytes; a row has a few kilobytes.")
         table = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(table, dict) or table.get("format") != FORMAT:
-            raise BadFile(f"{path} is no row of format {FORMAT}.")
+            raise BadFile(f"{path} is not a row of format {FORMAT}.")
         json.dumps(table, ensure_ascii=False).encode()  # a ValueError if no page can show it
         return from_mapping(Row, table, str(path))
     except (OSError, ValueError, TypeError, RecursionError, InputError) as error:
@@ -201,7 +201,7 @@ def _default_config(run: RunConfig) -> TaskConfig:
 def problem(row: Row) -> str:
     """Return why a row is not accepted, as a sentence; "" if it is."""
     if row.sealed().digest != row.digest:
-        return "its digest is not that of its content; it was changed after it was made."
+        return "its digest does not match its content; it was changed after it was made."
     env = row.run.env
     default = _default_config(row.run)
     shift = row.run.shift
@@ -217,7 +217,7 @@ def problem(row: Row) -> str:
         names = [name for name, value in table.items() if value != other[name]]
         return f"its env differs from the task's in {', '.join(names)}."
     if row.run.upset:
-        return "things go wrong in its episodes on purpose (upset)."
+        return "its episodes were upset on purpose (upset)."
     present = build_scene(env.scene).hash
     if row.scene_hash != present:
         return f"its scene {row.scene_hash[:12]} is not the present one, {present[:12]}."
@@ -225,7 +225,7 @@ def problem(row: Row) -> str:
     if len(row.successes) != count or len(row.steps) != count:
         return f"it has {count} starts, {len(row.successes)} outcomes and {len(row.steps)} lengths."
     if count < FEWEST or row.seeds != tuple(range(TEST_SEED, TEST_SEED + count)):
-        return f"its starts are not the first {FEWEST} or more from {TEST_SEED} on."
+        return f"its starts are not {FEWEST} or more in a row from {TEST_SEED} on."
     if not all(0 < steps <= env.max_steps for steps in row.steps):
         return f"an episode has no steps, or more than the task's {env.max_steps}."
     return ""
@@ -242,7 +242,7 @@ def write_leaderboard(folder: Path, out: Path) -> Board:
         BadFile: there is no such folder.
     """
     if not folder.is_dir():
-        raise BadFile(f"{folder} is no folder; give one with the files of rows.")
+        raise BadFile(f"{folder} is not a folder; give one with the files of rows.")
     taken: dict[str, Row] = {}
     refused: dict[str, str] = {}
     for path in sorted(folder.rglob("*.json")):
@@ -254,7 +254,7 @@ def write_leaderboard(folder: Path, out: Path) -> Board:
             refused[name] = _printable(str(error))
             continue
         if not wrong and row.digest in taken:
-            wrong = "the same row is there already."
+            wrong = "the same row is already there."
         if wrong:
             refused[name] = _printable(wrong)
         else:
@@ -329,7 +329,7 @@ def _table(rows: Sequence[Row]) -> list[dict[str, JSON]]:
 def _told(run: RunConfig) -> str:
     """Return what a policy is told that no robot knows; "" if that is nothing."""
     state = ["sees the state with the goal"] if run.sees_goal else []
-    ends = ["ends told by the simulator"] if run.termination == "privileged" else []
+    ends = ["ends given by the simulator"] if run.termination == "privileged" else []
     return "; ".join(state + ends)
 
 

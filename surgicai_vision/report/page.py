@@ -105,7 +105,7 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
     if not evaluated:
         return {
             "headline": "No cell has a result yet",
-            "lead": "What is missing, and why, stands below.",
+            "lead": "What is missing, and why, is listed below.",
         }
     if len(tasks) > 1:
         return _headline_of_many(evaluated, tasks)
@@ -130,7 +130,7 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
     ]
     return {
         "headline": sentence,
-        "lead": lead + (f" Beside it: {'; '.join(others[:FEW])}." if others else ""),
+        "lead": lead + (f" For comparison: {'; '.join(others[:FEW])}." if others else ""),
     }
 
 
@@ -153,7 +153,7 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
         )
         return {
             "headline": sentence,
-            "lead": f"{episodes:,} episodes; the intervals of each policy stand below.",
+            "lead": f"{episodes:,} episodes; each policy's interval is given below.",
         }
     bounds = (min(item.rate for item in best), max(item.rate for item in best))
     span = " to ".join(dict.fromkeys(map(percentages.percent, bounds)))
@@ -163,7 +163,7 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
         for item in best
     ]
     warning = (
-        "Each is the best of several and was chosen after the fact, so its interval flatters it."
+        "Each is the best of several and was chosen after the fact, so its interval is optimistic."
     )
     return {
         "headline": (

@@ -150,10 +150,10 @@ def _correlations(pairs: Sequence[tuple[ProbeRow, Point]]) -> str:
         mine = [(point.x, point.rate) for row, point in pairs if row.task == task]
         parts.append(f"{'all tasks' if task == ALL else task}: {_correlation(mine)}")
     if not parts:
-        return "No policy sees through a probed encoder, so there is nothing to correlate."
+        return "No policy uses a probed encoder, so there is nothing to correlate."
     return (
         f"Spearman's rank correlation of tip error and success: {'; '.join(parts)}. "
-        "Below 0 a better probe goes with more successes."
+        "Below 0, a better probe goes with more successes."
     )
 
 
@@ -162,7 +162,7 @@ def _correlation(pairs: Sequence[tuple[float, float]]) -> str:
         return f"{text.plural(len(pairs), 'pair')}, too few"
     errors, rates = np.array(pairs).T
     if len(set(errors)) == 1 or len(set(rates)) == 1:
-        return f"{len(pairs)} pairs, all alike in one of the two"
+        return f"{len(pairs)} pairs, all equal in one of the two"
     from scipy.stats import spearmanr
 
     found = spearmanr(errors, rates)

@@ -314,7 +314,7 @@ def _missing(
         add(run, NOT_RUN, str(skipped.get("reason", "")), str(skipped.get("key", "")))
     for item in planned:
         if item.state == TO_DO:
-            add(item.run, PENDING, item.reason or "the sweep has not come to it yet", item.key)
+            add(item.run, PENDING, item.reason or "the sweep has not reached it yet", item.key)
         elif item.state == NOT_RUN:
             add(item.run, NOT_RUN, item.reason, item.key)
     return sorted(found.values(), key=lambda item: (*order(item.condition), item.seed))
@@ -329,4 +329,4 @@ def _run_of(row: object, path: Path) -> RunConfig:
 def _last_line(text: str) -> str:
     """Return the last line of an error, which in a traceback names it."""
     lines = [line.strip() for line in text.strip().splitlines() if line.strip()]
-    return lines[-1] if lines else "no error was kept"
+    return lines[-1] if lines else "no error was recorded"

@@ -293,8 +293,8 @@ def markdown(found: Learned) -> str:
         *_rows(found.head, found.rows),
     ]
     if found.better:
-        head = ("beside", "probability of improvement", "tasks")
-        parts += [f"How probably a run of {found.best} beats one of another:", ""]
+        head = ("against", "probability of improvement", "tasks")
+        parts += [f"Probability that a run of {found.best} beats a run of another algorithm:", ""]
         parts += _rows(head, found.better)
     for chart in found.curves:
         parts += [f"{chart.title} (validation starts)", "", *_rows(chart.head, chart.rows)]

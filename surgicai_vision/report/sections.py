@@ -313,7 +313,7 @@ def caption(groups: Sequence[Group]) -> str:
         "missed": "never touched the needle",
         "dropped": "lost it",
         "wrong_hole": "went into another hole",
-        "time": "held it when the time was over",
+        "time": "still held it when time ran out",
         "physics": "diverged physics",
         "error": "no start or no finite action",
     }
@@ -337,7 +337,7 @@ def _starts(results: Sequence[Result]) -> str:
     ranges = text.either(f"{seeds[0]}–{seeds[-1]}" for seeds in sorted(counted))
     if len(counted) == 1:
         return f"the same starts, seeds {ranges}, for every policy"
-    return f"of each policy the starts of seeds {ranges}"
+    return f"for each policy, the starts of seeds {ranges}"
 
 
 def _short(reason: str, most: int = 160) -> str:

@@ -42,7 +42,7 @@ class Demonstrations:
     def mix(self, source: ReplayBuffer, share: float) -> None:
         """Draw a share of every batch from `source`."""
         if not 0 < share < 1:
-            raise InputError(f"share is {share}; it must be between 0 and 1, both left out.")
+            raise InputError(f"share is {share}; it must be above 0 and below 1.")
         self._source = source
         self._share = share
 

@@ -263,8 +263,8 @@ def fill(buffer: "BaseBuffer", transitions: Transitions) -> None:
     """
     if buffer.n_envs != 1:
         raise InputError(
-            f"The buffer is for {buffer.n_envs} envs side by side, and demonstrations are one "
-            "sequence; give a model of one env."
+            f"The buffer is for {buffer.n_envs} parallel envs, but demonstrations are one "
+            "sequence; give a model with one env."
         )
     last = ends(transitions)
     for row in range(len(transitions)):

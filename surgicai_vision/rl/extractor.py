@@ -118,7 +118,7 @@ class RelativeExtractor(StandardExtractor):
 
     def forward(self, observations: torch.Tensor | dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the standardised features (B, 24) of goal dicts."""
-        assert isinstance(observations, dict), "the relative features are those of a goal dict"
+        assert isinstance(observations, dict), "the relative features need a goal dict"
         parts = tuple(observations[part] for part in PARTS)
         features = self._memo.find(parts) if self._memo else None
         if features is None:

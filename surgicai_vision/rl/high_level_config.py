@@ -75,11 +75,11 @@ class HighLevelRequest:
     def __post_init__(self) -> None:
         if self.low.hlp != ORDER or self.low.termination != "privileged":
             raise InputError(
-                f"hlp is {self.low.hlp}, termination {self.low.termination}; PPO learns over "
-                f"a file with hlp: {ORDER} and termination: privileged."
+                f"hlp is {self.low.hlp}, termination {self.low.termination}; PPO needs a file "
+                f"with hlp: {ORDER} and termination: privileged."
             )
         if self.decisions < 1 or self.save_every < 1 or self.validation < 0 or self.seed < 0:
             raise InputError(
                 f"decisions is {self.decisions}, save_every {self.save_every}, validation "
-                f"{self.validation}, seed {self.seed}; at least 1, 1, 0 and 0."
+                f"{self.validation}, seed {self.seed}; they must be at least 1, 1, 0 and 0."
             )

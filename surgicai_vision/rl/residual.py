@@ -181,11 +181,13 @@ def base_of(request: ResidualRequest) -> PolicySpec:
     spec = open_policy(request.base)
     if spec.run.policy != "bc" or spec.run.task not in names.SUBTASKS:
         raise InputError(
-            f"{request.base} is '{spec.run.policy}' of '{spec.run.task}'; a policy of behaviour "
-            "cloning (bc) of one subtask can be corrected."
+            f"{request.base} is '{spec.run.policy}' of '{spec.run.task}'; only a "
+            "behaviour-cloning (bc) policy of one subtask can be corrected."
         )
     if spec.run.recipe_changes.get("progress_input"):
-        raise InputError(f"{request.base} is fed another policy's progress; give one with a clock.")
+        raise InputError(
+            f"{request.base} uses another policy's progress; give a policy with a clock."
+        )
     return spec
 
 
@@ -359,7 +361,9 @@ class _Training:
     def _write(self, weights: Weights, kept: Point, out: Path) -> Checkpoint:
         """Write the policy with these weights, which are those of the point kept."""
         if not all(torch.isfinite(weight).all() for weight in weights.values()):
-            raise InputError("The correction diverged: weights are not finite; learn more slowly.")
+            raise InputError(
+                "The correction diverged: weights are not finite; lower the learning rate."
+            )
         checkpoint = dataclasses.replace(
             self.base,
             run=run_of(self.request, self.base.run, self.model.num_timesteps),

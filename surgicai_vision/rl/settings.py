@@ -112,12 +112,12 @@ class Settings:
         for name in ("gamma", "tau", "demo_share", "bc_weight"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(
-                    f"{name} is {getattr(self, name)}; it must be between 0 and 1, both left out."
+                    f"{name} is {getattr(self, name)}; it must be above 0 and below 1."
                 )
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1.")
         if not 0 <= self.stop_at <= 1:
-            raise InputError(f"stop_at is {self.stop_at}; it is a share, from 0 to 1.")
+            raise InputError(f"stop_at is {self.stop_at}; it must be a share from 0 to 1.")
         _ = self.success_rule  # refuses what is not allowed
 
     @property
@@ -170,10 +170,10 @@ class Request:
         if algorithm.needs_demos and not self.demonstrations:
             raise InputError(f"'{self.algo}' learns from demonstrations; give some.")
         if not algorithm.needs_demos and self.demonstrations:
-            raise InputError(f"'{self.algo}' learns from no demonstrations; leave them out.")
+            raise InputError(f"'{self.algo}' does not learn from demonstrations; leave them out.")
         if algorithm.has_hindsight and self.observation != "relative":
             raise InputError(
-                f"'{self.algo}' relabels goals, which obs_type 'state' does not show apart; "
+                f"'{self.algo}' relabels goals, which obs_type 'state' does not show separately; "
                 "give observation relative."
             )
         if algorithm.has_hindsight and self.env.task not in names.SUBTASKS:
@@ -184,12 +184,12 @@ class Request:
             raise InputError(f"'{self.algo}' needs the sparse reward, not '{self.env.reward}'.")
         if self.save_every < 1 or self.validation < 0 or self.seed < 0:
             raise InputError(
-                f"save_every is {self.save_every}, validation {self.validation}, seed {self.seed}; "
-                "at least 1, 0 and 0."
+                f"save_every is {self.save_every}, validation {self.validation}, seed "
+                f"{self.seed}; they must be at least 1, 0 and 0."
             )
 
         if self.settings.stop_at and not self.validation:
-            raise InputError("stop_at counts validation starts; give validation of at least 1.")
+            raise InputError("stop_at refers to validation starts; give validation of at least 1.")
 
     @property
     def algorithm(self) -> Algorithm:

@@ -153,9 +153,9 @@ def of_demos(
     env.close()
     if not episodes:
         raise InputError(
-            f"None of {len(paths)} demonstrations succeeds when it is replayed with these options; "
-            "record them in this env, or leave the options out; where a success must hold, record "
-            "what comes after it (--post-success-steps)."
+            f"None of {len(paths)} demonstrations succeeds when replayed with these options; "
+            "record them in this env, or leave the options out; where a success must hold, also "
+            "record the steps after it (--post-success-steps)."
         )
     return Transitions(
         config=config,
@@ -192,8 +192,8 @@ def _check(path: Path, demo: Demo, env: SuturingEnv) -> None:
         wanted = getattr(env.config, name)
         if recorded != wanted:
             raise InputError(
-                f"{path} was recorded with {name} {recorded}, and is to be replayed with {wanted}; "
-                "give demonstrations of this env."
+                f"{path} was recorded with {name} {recorded}, but is to be replayed with "
+                f"{wanted}; give demonstrations of this env."
             )
     if demo.scene_hash != env.scene.hash:
         raise InputError(

@@ -197,7 +197,7 @@ class Psm:
             waiting = [entry for entry in self._queue if entry.channel != channel]
             self._queue = deque(waiting)
         elif len(self._queue) >= QUEUE:
-            raise InputError(f"{QUEUE} commands wait already; this one is dropped.")
+            raise InputError(f"{QUEUE} commands are already waiting; this one is dropped.")
         self._queue.append(_Command(channel, payload))
 
     def stop(self, reason: str) -> None:
@@ -305,9 +305,11 @@ class Psm:
         if self._max_age is not None and age > self._max_age:
             raise InputError(f"the message is {age:.2f} s old; allowed: {self._max_age:g} s.")
         if self._max_age is not None and age < -self._max_age:
-            raise InputError(f"its stamp is {-age:.2f} s ahead of this clock; set the clocks.")
+            raise InputError(
+                f"its stamp is {-age:.2f} s ahead of this clock; synchronise the clocks."
+            )
         if stamp < self._last_stamp.get(channel, 0):
-            raise InputError("it is older than one that was obeyed: out of order.")
+            raise InputError("the message is out of order: a newer one was already obeyed.")
         self._last_stamp[channel] = stamp
 
     def _is_contested(self, channel: str, source: str, now: int) -> bool:
@@ -366,7 +368,7 @@ class Endoscope:
             InputError: a motion, or a state command that is not possible.
         """
         if channel != STATE_COMMAND:
-            raise InputError("the endoscope of this scene stands still.")
+            raise InputError("the endoscope of this scene is fixed.")
         self.operating.command(_read_text(message))
         self.notes.append(Note("info", f"{_read_text(message)}: {self.operating.state}"))
 

@@ -145,8 +145,8 @@ class Client:
             if not deaf and not mute and (not self._is_simulated or self._is_answered(stamp)):
                 return
             if time.monotonic() > ends:
-                problems = [f"nobody hears {', '.join(deaf)}"] if deaf else []
-                problems += [f"nothing comes on {', '.join(mute)}"] if mute else []
+                problems = [f"nobody subscribes to {', '.join(deaf)}"] if deaf else []
+                problems += [f"nothing arrives on {', '.join(mute)}"] if mute else []
                 problems += [] if problems else ["a request is not answered"]
                 raise SurgicaiError(
                     f"No robot answers: {'; '.join(problems)}. Is it on, in the same domain and on "
@@ -274,7 +274,7 @@ class Client:
         """Wait until every topic that is published continually has at least `stamp`."""
         while missing := [name for name in self._inboxes if not self._has(name, stamp)]:
             if time.monotonic() > ends:
-                raise SurgicaiError(f"Nothing new has come on {', '.join(missing)}.")
+                raise SurgicaiError(f"Nothing new has arrived on {', '.join(missing)}.")
             self._transport.wait(POLL_S)
             self.update()
 

@@ -173,7 +173,9 @@ class DrivenRobot:
             return base
         if (own, frame) == (VIEW, WORLD):  # the simulation's world, where its endoscope is fixed
             return poses.compose(T_WORLD_VIEW, base)
-        raise InputError(f"{arm} speaks of '{own}'; the workspace's frame is '{frame}'.")
+        raise InputError(
+            f"{arm} reports poses in frame '{own}'; the workspace's frame is '{frame}'."
+        )
 
     def operating(self, arm: str) -> tuple[str, bool]:
         """Return an arm's operating state, "" before the first, and whether it is homed."""
@@ -206,15 +208,21 @@ class DrivenRobot:
 
     def _pose(self, topic: str) -> PoseStamped:
         heard = self.client.newest(topic)
-        assert heard is not None and isinstance(heard.message, PoseStamped), "the guards asked"
+        assert heard is not None and isinstance(heard.message, PoseStamped), (
+            "the guards require an input first"
+        )
         return heard.message
 
     def _angle(self, topic: str) -> float:
         """Return one finger's angle [rad] from a jaw's joint state."""
         heard = self.client.newest(topic)
-        assert heard is not None and isinstance(heard.message, JointState), "the guards asked"
+        assert heard is not None and isinstance(heard.message, JointState), (
+            "the guards require an input first"
+        )
         if len(heard.message.position) != 1 or not math.isfinite(heard.message.position[0]):
-            raise InputError(f"{topic} says {heard.message.position}; a jaw has one finite angle.")
+            raise InputError(
+                f"{topic} reports {heard.message.position}; a jaw has one finite angle."
+            )
         return float(heard.message.position[0]) * self.jaw_scale
 
     def _ours(self, arm: str, pose: Pose) -> Pose:
@@ -223,7 +231,7 @@ class DrivenRobot:
 
     def _image(self, view: str) -> NDArray[np.uint8]:
         heard = self.client.newest(self.client.image_topic(view))
-        assert heard is not None, "the guards asked"
+        assert heard is not None, "the guards require an input first"
         message = heard.message
         if isinstance(message, CompressedImage):
             frame = _decoded(message)

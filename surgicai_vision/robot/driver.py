@@ -163,7 +163,7 @@ class Driver:
         steps = held = 0
         latencies: list[float] = []
         image_latencies: list[float] = []
-        ended = "its time was over"
+        ended = "its time was up"
         due = time.monotonic()
         for number in range(max_steps):
             self._client.update()
@@ -234,7 +234,7 @@ class Driver:
         judged = self._client.judgement()
         if judged.get("physics_error"):
             return "the physics diverged"
-        return "the judge sees success" if judged.get("is_success") else ""
+        return "the judge reports success" if judged.get("is_success") else ""
 
     def _sleep_until(self, due: float) -> None:
         """Take messages until the next control step is due."""
@@ -280,15 +280,16 @@ class Driver:
             self._told = kind
             if now >= self._told_at.get(kind, -math.inf) + TELL_AGAIN_S:
                 self._told_at[kind] = now
-                self._tell(f"held: {problem}" if problem else "the guards let through")
+                self._tell(f"held: {problem}" if problem else "the guards let commands through")
         if self._config.sends or problem or time.monotonic() < self._next_line:
             return
         self._next_line = time.monotonic() + 1.0
         for arm, command in commands.items():
             x, y, z = (1e3 * value for value in poses.position(command.pose))
             self._tell(
-                f"dry run, {self._robot.subtask}: {arm} would be told ({x:.1f}, {y:.1f}, {z:.1f}) "
-                f"mm in its base, jaw {math.degrees(command.jaw / self._robot.jaw_scale):.0f}°"
+                f"dry run, {self._robot.subtask}: {arm} would be sent to ({x:.1f}, {y:.1f}, "
+                f"{z:.1f}) mm in its base, jaw "
+                f"{math.degrees(command.jaw / self._robot.jaw_scale):.0f}°"
             )
 
 
@@ -312,12 +313,12 @@ def check_drivable(agent: Agent, task: TaskConfig) -> None:
     """
     if agent.privileged:
         raise InputError(
-            f"{agent.name} reads the state of a simulation, which no robot has; give a policy fed "
-            "with images and measured poses, with learned ends."
+            f"{agent.name} reads the state of a simulation, which no robot has; give a policy "
+            "that uses images and measured poses, with learned ends."
         )
     if agent.depth:
         raise InputError(f"{agent.name} sees depth, which no topic here has.")
     if task.action_repeat != 1 or task.hold_jaw:
         raise InputError("a policy trained with action_repeat or hold_jaw cannot be driven yet.")
     if task.task not in (*names.SUBTASKS, names.SUTURE):
-        raise InputError(f"the task {task.task} is not of a dVRK's two arms.")
+        raise InputError(f"the task {task.task} is not for a dVRK's two arms.")

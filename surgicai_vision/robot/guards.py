@@ -121,7 +121,7 @@ def problem_of_inputs(
             return f"{arm} is not homed"
     for entry in inputs:
         if entry.age > entry.limit:
-            age = "has never come" if math.isinf(entry.age) else f"is {entry.age:.2f} s old"
+            age = "has never arrived" if math.isinf(entry.age) else f"is {entry.age:.2f} s old"
             return f"{entry.name} {age}"
     return ""
 
@@ -151,24 +151,24 @@ class TargetGuard:
         """Return why a set point may not be sent at the time `now` [s], or ""."""
         arm = planned.arm
         if not all(map(math.isfinite, planned.target)):
-            return f"{arm} would be told numbers that are not finite"
+            return f"{arm} would be sent numbers that are not finite"
         shift = poses.distance(planned.told, planned.target)
         turn = poses.angle(planned.told, planned.target)
         if shift > self._max_shift or turn > self._max_turn:
             return (
-                f"{arm} would be told a step of {1e3 * shift:.1f} mm, {math.degrees(turn):.1f}°; "
+                f"{arm} would be sent a step of {1e3 * shift:.1f} mm, {math.degrees(turn):.1f}°; "
                 f"allowed: {1e3 * self._max_shift:.1f} mm, {math.degrees(self._max_turn):.1f}°"
             )
         lead = poses.distance(planned.measured, planned.target)
         angle = poses.angle(planned.measured, planned.target)
         if lead > self._config.max_lead or angle > self._config.max_lead_angle:
             return (
-                f"{arm} does not follow: it would be told {1e3 * lead:.1f} mm, "
-                f"{math.degrees(angle):.0f}° from where it is measured"
+                f"{arm} does not follow: it would be sent {1e3 * lead:.1f} mm, "
+                f"{math.degrees(angle):.0f}° away from its measured pose"
             )
         speed = self._speed(planned, now)
         if speed > self._config.max_speed:
-            return f"{arm} would be told to move at {1e3 * speed:.0f} mm/s"
+            return f"{arm} would be commanded to move at {1e3 * speed:.0f} mm/s"
         return ""
 
     def remember(self, planned: Planned, now: float) -> None:

@@ -245,7 +245,7 @@ def _bytes_at(data: bytes, fields: str) -> slice:
         InputError: it is not one.
     """
     if data[:2] not in (b"\x00\x01", b"\x00\x07"):  # CDR or XCDR2, little-endian
-        raise InputError("an image came in an encoding other than little-endian CDR.")
+        raise InputError("an image arrived in an encoding other than little-endian CDR.")
     offset = 4 + 8  # the stamp
     number = 0
     for field in f"s{fields}u":
@@ -257,7 +257,7 @@ def _bytes_at(data: bytes, fields: str) -> slice:
         offset += 4 + (number if field == "s" else 0)
     end = offset + number
     if end > len(data):
-        raise InputError("an image came with fewer bytes than it announces.")
+        raise InputError("an image arrived with fewer bytes than it announces.")
     return slice(offset, end)
 
 

@@ -108,9 +108,11 @@ class RospyTransport:
         check_domain(domain)
         check_interface(interface)
         if domain:
-            raise InputError(f"ROS 1 has no domain {domain}; ROS_MASTER_URI keeps systems apart.")
+            raise InputError(
+                f"ROS 1 has no domains, got domain {domain}; separate systems with ROS_MASTER_URI."
+            )
         if rospy.core.is_initialized():
-            raise InputError("rospy can be opened once in a process.")
+            raise InputError("rospy can be opened only once per process.")
         self._dialect = dialect()
         self._codecs = Codecs(self._dialect)
         address = "127.0.0.1" if interface == LOOPBACK else _address(interface)

@@ -332,7 +332,7 @@ class Server:
         if self.robot.info["physics_error"]:
             for psm in self._psms.values():
                 if psm.operating.may_move:
-                    psm.stop("the physics diverged; ask for a reset")
+                    psm.stop("the physics diverged; request a reset")
 
     def _reset(self, seed: int) -> None:
         """Begin another episode; arms that may move still obey, but forget earlier commands."""

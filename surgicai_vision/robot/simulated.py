@@ -70,7 +70,7 @@ class SimulatedRobot:
             InputError: no such subtask, or a task of one subtask.
         """
         if not isinstance(self.env, Suture):
-            raise InputError(f"the task {self.env.task} has one subtask; nothing can be entered.")
+            raise InputError(f"the task {self.env.task} has one subtask; no other can be entered.")
         phase = names.SUBTASKS.index(check_name("subtask", subtask, names.SUBTASKS))
         self.env.enter(phase)
 

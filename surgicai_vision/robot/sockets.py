@@ -33,7 +33,7 @@ def check_interface(interface: str) -> None:
     """
     names = [name for _, name in socket.if_nameindex()]
     if interface not in names:
-        raise InputError(f"There is no interface '{interface}'; there are {', '.join(names)}.")
+        raise InputError(f"There is no interface '{interface}'; available: {', '.join(names)}.")
 
 
 def open_sockets() -> set[int]:
@@ -62,5 +62,6 @@ def keep_to(descriptors: set[int], interface: str) -> None:
                     one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, device)
     except OSError as error:
         raise InputError(
-            f"The sockets cannot be kept to {interface} ({error.strerror}); nothing was opened."
+            f"The sockets cannot be restricted to {interface} ({error.strerror}); nothing "
+            "was opened."
         ) from None

@@ -139,8 +139,8 @@ TRANSPORTS = MappingProxyType(
         ),
         "rclpy": _Entry(
             "surgicai_vision.robot.ros2:RclpyTransport",
-            "source ROS 2's setup.bash, of a Python like this one, and that of a workspace with "
-            "crtk_msgs; or take --transport cyclonedds, which needs no ROS",
+            "source ROS 2's setup.bash, built for this Python version, and that of a workspace "
+            "with crtk_msgs; or use --transport cyclonedds, which needs no ROS",
         ),
         "rospy": _Entry(
             "surgicai_vision.robot.ros1:RospyTransport",

@@ -102,8 +102,8 @@ class CameraPose:
         fovy: object = self.fovy
         if not isinstance(fovy, int | float | np.floating) or not 0.0 < fovy < math.pi:
             raise InputError(
-                f"fovy is {shown(fovy)}; give the vertical field of view in radians, between "
-                "0 and pi (math.radians(45) of 45 degrees)."
+                f"fovy is {shown(fovy)}; give the vertical field of view in radians, between 0 "
+                "and pi (math.radians(45) for 45 degrees)."
             )
         across = np.linalg.norm(np.cross(self.direction, self.up))
         if not across > PARALLEL * np.linalg.norm(self.direction) * np.linalg.norm(self.up):
@@ -318,8 +318,8 @@ def intrinsics(
     index = camera_id(model, camera)
     if window is None and stand(camera) != camera:
         raise InputError(
-            f"The place of the crop '{camera}' differs from frame to frame; give its window, or "
-            "ask the env: env.calibration.intrinsics(view)."
+            f"The position of the crop '{camera}' differs from frame to frame; give its window, "
+            "or ask the env: env.calibration.intrinsics(view)."
         )
     left, top, height, width = window or Window(0, 0, height, width)
     focal = height / 2 / math.tan(math.radians(float(model.cam_fovy[index])) / 2)

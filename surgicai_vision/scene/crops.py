@@ -75,13 +75,13 @@ def whole_size(crop: Crop, fovy: float, height: int, width: int) -> tuple[int, i
         raise InputError(
             f"A crop of {height} × {width} pixels that spans {crop.span * 1e3:g} mm does not fit "
             f"into the image of '{crop.camera}', which is {whole} × {across} at that resolution; "
-            "take a smaller span or a narrower image."
+            "use a smaller span or a narrower image."
         )
     if max(whole, across) > LARGEST:
         raise InputError(
-            f"A crop of {height} × {width} pixels that spans {crop.span * 1e3:g} mm is cut from an "
-            f"image of {whole} × {across}; at most {LARGEST} a side can be drawn: take a larger "
-            "span or a smaller image."
+            f"A crop of {height} × {width} pixels that spans {crop.span * 1e3:g} mm is cut from "
+            f"an image of {whole} × {across}; at most {LARGEST} per side can be drawn; use a "
+            "larger span or a smaller image."
         )
     return whole, across
 

@@ -75,7 +75,7 @@ def _new_context() -> _Context:
     """Return a context of the backend that $MUJOCO_GL names."""
     backend = _backend()
     if backend not in BACKENDS:
-        raise no_image("$MUJOCO_GL names no backend")
+        raise no_image("$MUJOCO_GL does not name a backend")
     try:
         module = importlib.import_module(BACKENDS[backend])
         return cast(_Context, module.GLContext(64, 64))
@@ -92,9 +92,9 @@ def _backend() -> str:
 def no_image(reason: str) -> InputError:
     """Return the error for a machine that cannot draw images: the reason and what to do."""
     return InputError(
-        f"No image can be drawn: '{_backend()}' gives no OpenGL ({reason}). On Debian or "
+        f"No image can be drawn: '{_backend()}' provides no OpenGL ({reason}). On Debian or "
         "Ubuntu run: sudo apt-get install --yes --no-install-recommends libegl1 libgl1 (Mesa; "
-        "`make setup` does it too). $MUJOCO_GL takes another of: "
+        "`make setup` does it too). Set $MUJOCO_GL to use another backend: "
         f"{', '.join(BACKENDS)}. Recording and the expert's evaluations need no images."
     )
 

@@ -190,8 +190,8 @@ class FrameRenderer:
         """Return MuJoCo's handle for a camera and keep it."""
         if crop_of(camera) is not None:
             raise InputError(
-                f"'{camera}' is a crop, whose place depends on the arm's reported joints; take its "
-                "image from an env's rig: envs.camera_rig.Images(env.simulation)."
+                f"'{camera}' is a crop, whose position depends on the arm's reported joints; "
+                "take its image from an env's rig: envs.camera_rig.Images(env.simulation)."
             )
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FIXED

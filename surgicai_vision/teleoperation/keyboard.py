@@ -35,7 +35,7 @@ TABLE = (
     Row(("Space",), "A", "close or open the jaw"),
     Row(("KeyX", "KeyZ"), "D-pad up, down", "open, close the jaw a little"),
     Row(("ShiftLeft", "ShiftRight"), "X, held", "slow and fine, a fifth of the speed"),
-    Row(("KeyV",), "Y", "lead with the next view: its image is large, its axes count"),
+    Row(("KeyV",), "Y", "switch to the next view: it is shown large, and its axes apply"),
     Row(("Enter",), "Start", "start without moving"),
     Row(
         ("ArrowRight",),
@@ -43,7 +43,7 @@ TABLE = (
         "keep a success and go on; else give up this start and go on",
     ),
     Row(("ArrowLeft",), "D-pad left", "discard and do the same start again"),
-    Row(("Escape",), "Back", "stop; a success that waits is kept"),
+    Row(("Escape",), "Back", "stop; a success not yet answered is kept"),
 )
 """What the help, the page and the documentation show."""
 

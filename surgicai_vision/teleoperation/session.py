@@ -169,14 +169,14 @@ class Session:
             self._start()
         elif event == DISCARD and self._state != WAITING:
             self.discarded += 1
-            self._reset(self._attempt.seed, "Discarded. The same start again.")
+            self._reset(self._attempt.seed, "Discarded. Same start again.")
         elif event == KEEP:
             self._advance()
 
     def _advance(self) -> None:
         """Keep the episode, or judge it, or give the start up, whichever is due."""
         if self._state == DRIVING and len(self._attempt):
-            self._judge("ended by you")
+            self._judge("you ended it")
             if self._keepable:
                 self._keep()
         elif self._state == JUDGED and self._keepable:
@@ -220,7 +220,7 @@ class Session:
         if self._attempt.success:
             self._message = "Success. → keeps it, ← does it again."
         else:
-            keeps = "keeps it all the same" if self._keepable else "goes on to the next start"
+            keeps = "keeps it anyway" if self._keepable else "goes on to the next start"
             self._message = f"No success ({reason}). ← does it again, → {keeps}."
 
     def _keep(self) -> None:
@@ -232,7 +232,7 @@ class Session:
         kept = f"Kept as episode {number} ({len(self._attempt) / names.FPS:.1f} s)."
         if self.rules.episodes is not None and self.kept >= self.rules.episodes:
             self._state = STOPPED
-            self._message = f"{kept} All {self.kept} are recorded."
+            self._message = f"{kept} All {self.kept} episodes are recorded."
             return
         self._reset(self._recordings.next_seed, kept)
 
@@ -253,4 +253,4 @@ class Session:
         self._attempt.info = self.env.measure()
         self._was_released = False
         self._state = WAITING
-        self._message = f"{message} Move to start.".strip()
+        self._message = f"{message} Move to begin.".strip()

@@ -194,7 +194,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         )
     if plain.pop("card_sha256", None) != digest(plain):
         raise BadFile(
-            f"{folder / CARD} was changed after training (its hash does not fit); train again."
+            f"{folder / CARD} was changed after training (its hash does not match); train again."
         )
     try:
         checkpoint = replace(from_mapping(Checkpoint, plain, str(folder / CARD)), folder=folder)
@@ -257,8 +257,8 @@ def check_encoder(checkpoint: Checkpoint, encoder: "Encoder | None") -> None:
         if given[key] != value:
             raise InputError(
                 f"The checkpoint {checkpoint.folder} was trained on encoder '{wanted.name}' with "
-                f"{key} {value}, got '{encoder.card.name}' with {given[key]}; "
-                "hand over the same with --weights."
+                f"{key} {value}, got '{encoder.card.name}' with {given[key]}; give the same one "
+                "with --weights."
             )
 
 

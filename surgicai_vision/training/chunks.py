@@ -73,8 +73,8 @@ def timeline_of(dataset: Dataset, demos: Path | None = None) -> Timeline:
 def _from_demos(dataset: Dataset, folder: Path) -> Timeline:
     """Return the timeline of a dataset whose demonstrations lie in `folder`."""
     need = (
-        f"{dataset.path} holds {dataset.fps} frames a second, and a policy that plans chunks "
-        f"learns from the action of every control step, {names.FPS} a second"
+        f"{dataset.path} holds {dataset.fps} frames per second, and a policy that plans chunks "
+        f"learns from the action of every control step, {names.FPS} per second"
     )
     try:
         paths = list_demos(folder)
@@ -83,7 +83,9 @@ def _from_demos(dataset: Dataset, folder: Path) -> Timeline:
     if not isinstance(dataset, RenderedDataset) or (
         demos_digest(paths) != dataset.meta["demos_digest"]
     ):
-        raise InputError(f"{need}; {folder} holds other demonstrations. Give its own by --demos.")
+        raise InputError(
+            f"{need}; {folder} holds other demonstrations. Give the dataset's own with --demos."
+        )
     shown = [read_demo(path) for path in paths]
     lengths = np.array([len(demo) for demo in shown])
     begins = np.concatenate([[0], np.cumsum(lengths)[:-1]])

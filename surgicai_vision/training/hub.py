@@ -103,7 +103,7 @@ def model_card(
 {task_text(task)}
 
 A policy for the task `{task}` in simulated robotic suturing, trained by imitation with
-surgicai-vision ({checkpoint.code_version}). It is no medical device.
+surgicai-vision ({checkpoint.code_version}). It is not a medical device.
 
 | | |
 |---|---|
@@ -185,8 +185,8 @@ def push_policy(
     restore(checkpoint)
     if checkpoint.progress_sha256:
         raise InputError(
-            f"{folder} is fed the progress that another policy says, and one repository holds one "
-            "policy; push a policy without progress_input."
+            f"{folder} uses the progress that another policy predicts, and one repository holds "
+            "one policy; push a policy without progress_input."
         )
     api = connect(repo, api)
     from huggingface_hub import CommitOperationAdd
@@ -235,7 +235,7 @@ def pull_policy(
             restore(read_checkpoint(fetched))
         except BadFile as error:
             problem = str(error).replace(f"{fetched}{os.sep}", "").replace(str(fetched), "it")
-            raise BadFile(f"{repo} holds no policy that can be used: {problem}") from None
+            raise BadFile(f"{repo} holds no usable policy: {problem}") from None
         if out.exists():
             out.rmdir()  # empty: checked before
         os.rename(fetched, result)

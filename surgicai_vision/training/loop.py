@@ -239,7 +239,7 @@ class Training:
             total += self._update(rows) * len(rows)
         if not np.isfinite(total):
             raise SurgicaiError(
-                "The training loss is not finite; lower the learning rate or look at the features."
+                "The training loss is not finite; lower the learning rate or check the features."
             )
         return total / len(self.rows)
 

@@ -182,7 +182,7 @@ def _changed(values: Mapping[str, object], changes: Mapping[str, JSON]) -> dict[
             continue
         entries = changed.get(table, {})
         if not isinstance(entries, Mapping) or not entry:
-            raise InputError(f"change '{key}': {table} is no table that has such an entry.")
+            raise InputError(f"change '{key}': {table} is not a table with such an entry.")
         changed[table] = {**entries, entry: value}
     return changed
 
@@ -202,12 +202,13 @@ def check_progress_from(recipe: "Recipe", progress_from: Path | None) -> None:
     """Refuse a recipe that feeds progress without a policy that predicts it, and vice versa."""
     if recipe.progress_input and progress_from is None:
         raise InputError(
-            "The recipe feeds progress; give the policy that says it (--progress-from DIR)."
+            "The recipe uses progress as an input; give the policy that predicts it "
+            "(--progress-from DIR)."
         )
     if progress_from is not None and not recipe.progress_input:
         raise InputError(
-            f"The recipe feeds no progress; leave --progress-from {progress_from} out, or give "
-            "--change progress_input=true (and clock=false)."
+            "The recipe does not use progress as an input; leave --progress-from "
+            f"{progress_from} out, or give --change progress_input=true (and clock=false)."
         )
 
 
@@ -246,7 +247,7 @@ def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> 
         if name not in plugin.recipe.__dataclass_fields__:
             raise InputError(
                 f"'{checkpoint.policy}' answers with one action and has no {name} to change; "
-                "policies that plan chunks have."
+                "only policies that plan chunks have one."
             )
     recipe = {**checkpoint.recipe, **changes}
     try:

@@ -48,12 +48,12 @@ def check_progress_policy(checkpoint: Checkpoint, dataset: Dataset) -> None:
     folder = checkpoint.folder
     if not checkpoint.recipe.get("progress"):
         raise InputError(
-            f"{folder} says no progress; train one with --policy hlp --recipe high-level."
+            f"{folder} does not predict progress; train one with --policy hlp --recipe high-level."
         )
     allowed = dict.fromkeys((dataset.config.task, names.SUTURE))
     if checkpoint.task.task not in allowed:
         raise InputError(
-            f"{folder} says the progress of '{checkpoint.task.task}'; allowed here: "
+            f"{folder} predicts the progress of '{checkpoint.task.task}'; allowed here: "
             f"{', '.join(allowed)}."
         )
     if checkpoint.views and checkpoint.image_size != dataset.image_size:

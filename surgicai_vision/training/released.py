@@ -123,13 +123,13 @@ def resolve(given: str | Path) -> Path:
     known = released_names()
     if not known:
         raise InputError(
-            f"{given}: no policy is released in {released_folder()}; "
-            "build them by `surgicai-vision release`."
+            f"{given}: no policy is released in {released_folder()}; build them with "
+            "`surgicai-vision release`."
         )
     if name not in known:
         raise UnknownName("released policy", name, known)
     card = read_card(name)
-    again = f"build it anew by `surgicai-vision release --only {name}`."
+    again = f"rebuild it with `surgicai-vision release --only {name}`."
     problem = mismatch(card)
     if problem:
         raise InputError(f"{given} {problem}; {again}")
@@ -137,7 +137,7 @@ def resolve(given: str | Path) -> Path:
     _check_files(folder, card.files)
     for part, sha256 in card.parts.items():
         if part not in known or read_card(part).files.get(WEIGHTS) != sha256:
-            raise BadFile(f"{given} was counted with another {PREFIX}{part}; {again}")
+            raise BadFile(f"{given} was evaluated with a different {PREFIX}{part}; {again}")
     return folder / PROCEDURE if PROCEDURE in card.files else folder
 
 
@@ -163,15 +163,15 @@ def read_card(name: str) -> ReleaseCard:
     found = plain.get("format") if isinstance(plain, dict) else None
     if found != FORMAT:
         raise BadFile(
-            f"{path} has format {found!r}, of another version; this one reads {FORMAT}. "
-            f"Build it anew by `surgicai-vision release --only {name}`."
+            f"{path} has format {found!r}, of another version; this one reads {FORMAT}. Rebuild "
+            f"it with `surgicai-vision release --only {name}`."
         )
     try:
         return from_mapping(ReleaseCard, plain, str(path))
     except (InputError, TypeError) as error:
         raise BadFile(
-            f"{path} is of another version ({str(error).rstrip('.')}); "
-            f"build it anew by `surgicai-vision release --only {name}`."
+            f"{path} is of another version ({str(error).rstrip('.')}); rebuild it with "
+            f"`surgicai-vision release --only {name}`."
         ) from None
 
 
@@ -182,7 +182,7 @@ def mismatch(card: ReleaseCard) -> str:
     present = build_scene(card.env.scene).hash
     if present == card.scene_hash:
         return ""
-    return f"was trained in scene {card.scene_hash[:12]}, and the present one is {present[:12]}"
+    return f"was trained in scene {card.scene_hash[:12]}, and the present scene is {present[:12]}"
 
 
 def write_released(card: ReleaseCard, contents: Mapping[str, bytes]) -> Path:

@@ -70,7 +70,7 @@ class TrainingRequest:
             return self.policy.make(self.recipe, tuple(entry.shape for entry in self.features))
         except (RuntimeError, MemoryError) as error:  # torch has no specific error for this
             raise InputError(
-                f"Policy '{self.policy.name}' cannot be built by its recipe "
+                f"Policy '{self.policy.name}' cannot be built from its recipe "
                 f"({first_line(error)}); choose smaller layers."
             ) from None
 

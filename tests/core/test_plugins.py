@@ -133,7 +133,7 @@ PARTS: dict[str, tuple[Callable[[], object], str]] = {
     "task": (lambda: register_task(cast(Any, int)), "must be a subclass of .*Subtask"),
     "methods": (
         lambda: register_task(cast(Any, Abstract)),
-        "lacks what .* leaves to it: start, target",
+        "lacks what .* requires: start, target",
     ),
     "tolerances": (lambda: register_task(Intolerant), "lacks tolerances and demands"),
     "camera": (lambda: register_camera("x", cast(Any, {})), "must be a scene.cameras.CameraPose"),

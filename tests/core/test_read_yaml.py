@@ -15,17 +15,17 @@ from surgicai_vision.experiments.plan_config import read_plan
 from surgicai_vision.training.policies import load_recipe
 
 WRONG = {
-    "list": (b"- 1\n- 2\n", "no table"),
-    "no list": (b"[]", "no table"),
-    "text": (b"true", "no table"),
-    "numbers as keys": (b"1: 2", "no table"),
+    "list": (b"- 1\n- 2\n", "not a table"),
+    "no list": (b"[]", "not a table"),
+    "text": (b"true", "not a table"),
+    "numbers as keys": (b"1: 2", "not a table"),
     "open": (b"a: [", "not valid YAML"),
     "code": (b"!!python/object/apply:os.system ['true']", "not valid YAML"),
     "bytes": (b"\xff\xfe\x00", "not valid YAML"),
     "no such day": (b"a: 2026-02-31", "refused: ValueError"),
     "deep": (b"a: " + b"[" * 5000, "refused: RecursionError"),
-    "key twice": (b"a: 1\nb: {c: 1, 'c': 2}", "not valid YAML.*'c' stands twice"),
-    "key twice beside a merge": (b"a: &a {c: 1}\nb: {<<: *a, c: 2, c: 3}", "'c' stands twice"),
+    "key twice": (b"a: 1\nb: {c: 1, 'c': 2}", "not valid YAML.*'c' appears twice"),
+    "key twice beside a merge": (b"a: &a {c: 1}\nb: {<<: *a, c: 2, c: 3}", "'c' appears twice"),
     "alias of itself": (b"a: &a [*a]", "a value that it is a part of"),
     "aliases of aliases": (
         b"a: &a0 [1, 1]\n"
@@ -98,13 +98,13 @@ def test_an_empty_file_is_a_table_only_where_it_may_be(tmp_path):
     assert read_yaml(path, may_be_empty=True) == {}
     assert load_recipe("bc", path) == load_recipe("bc", path, {})
     for read in (read_yaml, read_hierarchical, read_plan):
-        with pytest.raises(BadFile, match="no table"):
+        with pytest.raises(BadFile, match="not a table"):
             read(path)
 
 
 def test_a_change_that_no_value_stands_for_is_refused():
     for value in ("[", "2026-02-31", "[" * 5000):
-        with pytest.raises(InputError, match="no YAML value"):
+        with pytest.raises(InputError, match="not a YAML value"):
             read_changes((f"a={value}",))
 
 

@@ -92,7 +92,7 @@ def test_a_failure_leaves_the_earlier_video(tmp_path):
 @pytest.mark.parametrize(
     ("name", "frames", "message"),
     [
-        ("a.avi", moving(2), "no .mp4 file"),
+        ("a.avi", moving(2), "not a .mp4 file"),
         ("a.mp4", [], "no frames"),
         ("a.mp4", moving(2, 63, 64), "63 × 64"),
     ],
@@ -122,7 +122,7 @@ def test_an_animation_holds_its_frames_in_order_and_runs_for_ever(tmp_path):
 
 
 def test_what_cannot_be_an_animation_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"no \.webp file"):
+    with pytest.raises(InputError, match=r"not a \.webp file"):
         write_animation(tmp_path / "a.gif", moving(2), 10)
     with pytest.raises(InputError, match="no frames"):
         write_animation(tmp_path / "a.webp", [], 10)

@@ -144,7 +144,7 @@ def test_views_of_a_video_dataset(tmp_path, demos):
         open_dataset(tmp_path / "back").frames("back"),
         open_dataset(tmp_path / "video").frames("back"),
     )
-    with pytest.raises(InputError, match="holds videos already"):
+    with pytest.raises(InputError, match="already holds videos"):
         convert_dataset(tmp_path / "video", tmp_path / "again", video="av1")
 
 

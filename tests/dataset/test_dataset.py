@@ -129,7 +129,7 @@ def test_every_fifth_frame_is_one_of_all(tmp_path, fake, demos, monkeypatch):
         with_frame_stride(few, 1)
     with pytest.raises(InputError, match=r"frame_stride is 4; .* 1, 2, 5, 10, 25, 50"):
         render(demos, tmp_path / "none", frame_stride=4)
-    with pytest.raises(InputError, match="a replay needs each step's"):
+    with pytest.raises(InputError, match="a replay needs one for each step"):
         open_policy("replay", dataset=few)
 
 
@@ -200,9 +200,9 @@ def test_bad_requests_are_refused_before_any_work(tmp_path, demos):
         render(demos, tmp_path / "set", views=("front", "front"))
     with pytest.raises(InputError, match="size is 4"):
         render(demos, tmp_path / "set", size=4)
-    with pytest.raises(InputError, match="size is 63, and a video of h264 needs an even one"):
+    with pytest.raises(InputError, match="size is 63, and an h264 video needs an even size"):
         render(demos, tmp_path / "set", size=63, video="h264")
-    with pytest.raises(InputError, match="size is 16, and a video of av1 needs at least 32"):
+    with pytest.raises(InputError, match="size is 16, and an av1 video needs at least 32"):
         render(demos, tmp_path / "set", size=16, video="av1")
     with pytest.raises(BadFile, match="not a folder of demonstrations"):
         render(tmp_path / "nothing", tmp_path / "set")
@@ -478,7 +478,7 @@ DAMAGE = {
         lambda t: with_image(t, FRONT, 2, image(np.eye(20, dtype=np.uint8)[..., None])),
         "20 × 20",
     ),
-    "repeated": (lambda t: with_image(t, FRONT, 2, 1), "frame 2.*image before it again"),
+    "repeated": (lambda t: with_image(t, FRONT, 2, 1), "frame 2.*identical to the previous image"),
     "no image": (
         lambda t: with_image(t, FRONT, 1, {"bytes": b"PNG", "path": "x"}),
         "cannot be decoded",
@@ -497,7 +497,7 @@ DAMAGE = {
     "seed": (lambda t: with_value(t, names.SEED, 0, 77), "different seeds"),
     "statistics": (
         lambda t: with_value(t, names.REWARD, 0, -50.0),
-        "min of next.reward is not that",
+        "min of next.reward does not match",
     ),
     "content": (lambda t: with_value(t, names.ACTION, 0, [0.1] * 7), "digest: the content has"),
 }
@@ -571,7 +571,7 @@ def test_check_finds_damaged_metadata(tmp_path, fake, demos):
     info = tmp_path / "set/meta/info.json"
     info.write_text(info.read_text().replace('"total_episodes": 3', '"total_episodes": 4'))
     assert (
-        "meta/info.json: its counts are not those of the data."
+        "meta/info.json: its counts differ from the data."
         in check_dataset(tmp_path / "set").problems
     )
     (tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").write_bytes(b"")

@@ -111,11 +111,11 @@ def test_splits_and_counts_go_by_the_demonstration(dataset):
         assert len(episodes) == (3 if kind == "episode" else 0)
     first = first_episodes(dataset, 1)
     assert (first.length, len(first.bounds())) == (3 * STEPS, 3)
-    with pytest.raises(InputError, match="3 demonstrations were asked"):
+    with pytest.raises(InputError, match="3 demonstrations were requested"):
         first_episodes(dataset, 3)
     strided = with_frame_stride(dataset, 2)
     np.testing.assert_array_equal(strided.demonstration_index, np.repeat([0, 1], 3))
-    assert "Every 3 episodes in a row show one demonstration" in dataset_card(dataset, "a/b")
+    assert "Every 3 consecutive episodes show one demonstration" in dataset_card(dataset, "a/b")
 
 
 def test_a_killed_rendering_goes_on_and_a_finished_one_does_nothing(demos, dataset, tmp_path):

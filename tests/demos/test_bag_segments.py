@@ -125,7 +125,7 @@ def test_nothing_to_segment_by_is_said(tmp_path):
     found = streams(shown("place"), labels=False)
     del found["needle"]
     bag = write_bag(tmp_path / "trial", "mcap", found)
-    with pytest.raises(InputError, match=r"no labels and no needle.*--task"):
+    with pytest.raises(InputError, match=r"neither labels nor a needle pose.*--task"):
         import_bags([bag], task=None, out=tmp_path / "demos")
     with pytest.raises(InputError, match="need the needle's pose"):
         import_bags(

@@ -35,11 +35,11 @@ def test_topics_that_are_not_there_are_refused_with_those_that_are(trial, tmp_pa
         ),
         (
             BagConfig(topics=Topics(needle="/PSM1/jaw/measured_js")),
-            "holds sensor_msgs/JointState; needle is read from",
+            "holds sensor_msgs/JointState; types allowed for needle:",
         ),
         (
             BagConfig(topics=Topics(psm2_pose="/PSM2/jaw/measured_js")),
-            "psm2_pose is read from geometry_msgs/PoseSt",
+            "types allowed for psm2_pose: geometry_msgs/PoseSt",
         ),
     ):
         with pytest.raises(InputError, match=message) as caught:
@@ -162,5 +162,5 @@ def test_missing_and_packed_bags_are_told(tmp_path):
         "compression_format": "zstd",
     }
     (bag / "metadata.yaml").write_text(yaml.safe_dump(table))
-    with pytest.raises(BadFile, match="unpack it first"):
+    with pytest.raises(BadFile, match="decompress it first"):
         import_bags([bag], task="grasp", out=tmp_path / "demos")

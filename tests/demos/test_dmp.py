@@ -304,7 +304,7 @@ def test_records_what_it_generates(demonstrated, tmp_path):
     assert len(read_marker(out)["request"]["demos"]) == 1
     with pytest.raises(InputError, match="learns from demonstrations"):
         record(TaskConfig("insert"), episodes=1, out=tmp_path / "none", demonstrator="dmp")
-    with pytest.raises(InputError, match="learns from no demonstrations"):
+    with pytest.raises(InputError, match="does not learn from demonstrations"):
         record(
             TaskConfig("insert"), episodes=1, out=tmp_path / "none", demos=[demonstrated["insert"]]
         )

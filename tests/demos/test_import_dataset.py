@@ -141,7 +141,7 @@ def test_episodes_that_do_not_show_the_task_are_skipped(demos: list[Demo], tmp_p
     assert reasons["episode 0"] == (
         "The recording shows no place; segmented by labels it shows grasp"
     )
-    assert reasons["episode 2"].startswith("The topics overlap in 0.0 s")
+    assert reasons["episode 2"].startswith("The topics overlap for 0.0 s")
     with pytest.raises(InputError, match="episode 0: insert: The recording shows no insert"):
         import_dataset(path, task="insert", out=tmp_path / "none")
 
@@ -221,7 +221,10 @@ def test_a_frame_of_theirs_is_given_in_the_arm_s_base(demos: list[Demo], tmp_pat
     [
         (lambda rows: {**rows, names.STATE: [[np.nan] * 16] * len(rows["phase"])}, "finite"),
         (lambda rows: {**rows, names.STATE: [[0.1] * 16] * len(rows["phase"])}, "unit quaternion"),
-        (lambda rows: {**rows, names.STATE: [[0.1] * 3] * len(rows["phase"])}, "fewer than named"),
+        (
+            lambda rows: {**rows, names.STATE: [[0.1] * 3] * len(rows["phase"])},
+            "fewer than are named",
+        ),
     ],
 )
 def test_damaged_numbers_are_refused(

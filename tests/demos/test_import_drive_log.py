@@ -18,8 +18,8 @@ LINE = {"episode": 0, "step": 0, "phase": 0, "both_arms": [0.1] * 14}
     [
         ("step", 10**18, "line 2: step must be within 0 and 1000000000"),
         ("step", -1, "line 2: step must be within"),
-        ("step", float("inf"), "line 2 is none of a log"),
-        ("both_arms", [10**400] * 14, "line 2 is none of a log"),
+        ("step", float("inf"), "line 2 is not a line of a log"),
+        ("both_arms", [10**400] * 14, "line 2 is not a line of a log"),
     ],
 )
 def test_a_number_that_is_too_large_is_a_bad_file(

@@ -187,7 +187,7 @@ def test_records_with_its_sources_named_whatever_the_choice(sources, tmp_path):
     assert not {demo.seed for demo in demos} & {read_demo(path).seed for path in sources["grasp"]}
     again = record(config, episodes=2, seed=seed, out=tmp_path / "two", **how)
     assert [path.read_bytes() for path in kept] == [path.read_bytes() for path in again]
-    with pytest.raises(InputError, match="multiplied itself"):
+    with pytest.raises(InputError, match="is itself a multiplied"):
         Multiplier(envs.make(config), kept)
 
 
@@ -220,7 +220,7 @@ def test_refuses_what_does_not_fit(sources, tmp_path):
     demo = dataclasses.replace(read_demo(sources["grasp"][0]), scene_hash="0" * 64)
     with pytest.raises(InputError, match="recorded in another scene"):
         Multiplier(grasp, [write_demo(tmp_path, 0, demo)])
-    with pytest.raises(InputError, match="'expert' chooses no demonstration"):
+    with pytest.raises(InputError, match="'expert' does not choose a demonstration"):
         record(TaskConfig("grasp"), episodes=1, out=tmp_path / "none", source="random")
 
 

@@ -116,7 +116,8 @@ def test_a_transfer_that_breaks_off_goes_on_by_itself(hub: Hub) -> None:
 def test_another_call_goes_on_where_the_last_one_broke_off(hub: Hub, tmp_path: Path) -> None:
     hub.cuts = [120_000, 0]
     with pytest.raises(
-        MissingWeights, match=r"120000 of 300000 bytes.*the same command goes on.*imagenet-lite"
+        MissingWeights,
+        match=r"120000 of 300000 bytes.*run the same command to resume.*imagenet-lite",
     ):
         find()
     (partial,) = parts(tmp_path)

@@ -200,6 +200,6 @@ def test_files_that_would_run_code_are_refused(tmp_path: Path) -> None:
             return (Path(tmp_path / "harm").touch, ())  # type: ignore[return-value]
 
     saved(tmp_path / "harm.bin", {"convnet.conv1.weight": Harm()})
-    with pytest.raises(BadFile, match="weights alone"):
+    with pytest.raises(BadFile, match="holds only weights"):
         load_encoder("r3m-18", weights=WeightsSource.of(tmp_path / "harm.bin"))
     assert not (tmp_path / "harm").exists()

@@ -73,7 +73,7 @@ def test_the_wide_layouts_narrowest_pair_needs_a_longer_arc():
 @pytest.mark.parametrize("layout", ["3dmed", "3dmed_straight"])
 def test_a_half_circle_comes_round_to_a_steep_flank(layout):
     message = refused("pullout", SceneConfig(layout=layout), needle_arc="1/2")
-    assert "come round" in message and "1/2" in message
+    assert "reached the flank" in message and "1/2" in message
 
 
 @pytest.mark.parametrize("pair", PAIRS["simple"])

@@ -47,7 +47,7 @@ def test_only_what_is_looked_at_is_rendered_and_once(monkeypatch: pytest.MonkeyP
     assert observation["back_psm2"] is kept and rendered == ["back_psm2"]
     env.step(np.zeros(7, np.float32))
     assert observation["back_psm2"] is kept, "what was looked at stays"
-    with pytest.raises(InputError, match="'front' of an observation is looked at for the first"):
+    with pytest.raises(InputError, match="'front' of an observation is read for the first"):
         observation["front"]
     with pytest.raises(KeyError):
         observation["back"]

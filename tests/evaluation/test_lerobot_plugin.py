@@ -602,7 +602,7 @@ def test_what_evaluate_cannot_use_is_refused_in_one_line(trained: Path, tmp_path
     depth = {"observation.images.back_depth": {"type": "VISUAL", "shape": [1, SIZE, SIZE]}}
     with pytest.raises(UnknownName, match="back_depth"):
         open_policy(changed(source, tmp_path / "depth", input_features=depth))
-    with pytest.raises(BadFile, match="is no configuration"):
+    with pytest.raises(BadFile, match="is not a LeRobot configuration"):
         open_policy(changed(source, tmp_path / "typeless", type=None))
 
 

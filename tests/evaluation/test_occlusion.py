@@ -87,7 +87,7 @@ def test_refuses_what_cannot_be_asked():
         occlusion(ZeroAgent(), CONFIG, 0, (0,), 8)
     with pytest.raises(InputError, match="whole procedure"):
         occlusion(CornerAgent(), TaskConfig("suture"), 0, (0,), 8)
-    with pytest.raises(InputError, match="give some, from 0"):
+    with pytest.raises(InputError, match="give at least one, from 0"):
         occlusion(CornerAgent(), CONFIG, 0, (), 8)
     with pytest.raises(InputError, match="the image's side, 48 px"):
         occlusion(CornerAgent(), CONFIG, 0, (0,), 64)

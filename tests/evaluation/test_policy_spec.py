@@ -97,15 +97,15 @@ def test_a_factory_elsewhere_makes_the_agent(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        (f"{__name__}:not_an_agent", "gives int"),
+        (f"{__name__}:not_an_agent", "returns int"),
         (f"{__name__}:nothing", "cannot be imported"),
         ("json:loads", "fails with TypeError .*takes no arguments"),
         (f"{__name__}:interrupted", "fails with StopIteration"),
         ("this_module_fails:make", "fails with ZeroDivisionError"),
         ("no_such_module:make", "cannot be imported"),
-        (":x", "names no function"),
-        ("json:", "names no function"),
-        (".json:loads", "names no function"),
+        (":x", "is not a function in"),
+        ("json:", "is not a function in"),
+        (".json:loads", "is not a function in"),
         ("replay", "give a dataset"),
         ("missing.yaml", "Cannot read"),
         ("expret", "Did you mean 'expert'"),
@@ -131,8 +131,8 @@ def test_what_is_no_policy_is_refused(
             "no shape",
         ),
         ("config.json", {"output_features": {"action": {"shape": [7]}}}, "no type"),
-        ("config.json", {"output_features": [7]}, "'output_features' is no table"),
-        ("train_config.json", {"env": ["surgicai"]}, "'env' is no table"),
+        ("config.json", {"output_features": [7]}, "'output_features' is not a table"),
+        ("train_config.json", {"env": ["surgicai"]}, "'env' is not a table"),
         ("train_config.json", {"env": {"type": "surgicai", "encoder": "random"}}, "'cameras' is"),
     ],
 )
@@ -162,7 +162,7 @@ def test_options_that_do_not_go_with_a_policy_are_refused(tmp_path: Path) -> Non
         open_policy(grasp, task="place")
     with pytest.raises(InputError, match="--expert-swap place"):
         open_policy(grasp, expert_swap="place")
-    with pytest.raises(InputError, match="the task is an option of its own"):
+    with pytest.raises(InputError, match="the task is a separate option"):
         open_policy(grasp, env={"task": "place"})
     with pytest.raises(UnknownName, match="max_steps"):
         open_policy(grasp, env={"max_step": 3})

@@ -111,7 +111,7 @@ def test_both_rounds_become_one_dataset(driven, tmp_path):
     meta = json.loads((tmp_path / "both/meta/surgicai.json").read_text())
     assert [request["seed"] for request in meta["demos_requests"]] == [0, 1000]
     other = record(TaskConfig("insert"), episodes=1, out=tmp_path / "insert")
-    with pytest.raises(BadFile, match="another task or scene"):
+    with pytest.raises(BadFile, match="not made with the same task and scene"):
         render_demos(
             [tmp_path / "first", other[0].parent], tmp_path / "mixed", views=("front",), size=16
         )

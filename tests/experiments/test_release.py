@@ -189,7 +189,7 @@ def test_files_and_parts_that_differ_from_their_card_are_refused(as_built):
         weights.write_bytes(content)
     card = json.loads((released.released_folder() / "suture" / released.CARD).read_text())
     changed("suture", parts={**card["parts"], "place": "0" * 64})
-    with pytest.raises(BadFile, match="counted with another released:place"):
+    with pytest.raises(BadFile, match="evaluated with a different released:place"):
         open_policy("released:suture")
 
 

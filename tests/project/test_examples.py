@@ -31,7 +31,7 @@ SMALL = {
 }
 """Script → arguments that make it small."""
 SAYS = {
-    "environment": "the same again from step 20: True",
+    "environment": "replayed from step 20, the same final state: True",
     "record_and_render": "1 episodes",
     "train_in_python": "proprioception-paper+epochs=1: ",
     "own_encoder": "thumbnail-front-paper+epochs=1: ",

@@ -115,7 +115,7 @@ def test_a_whole_procedure_has_the_env_of_its_policy(
     assert problem(whole) == ""
     write_row(whole, tmp_path / "row.json")
     text = write_leaderboard(tmp_path, tmp_path / "page.html").page.read_text(encoding="utf-8")
-    assert ("ends told by the simulator" in text) == told
+    assert ("ends given by the simulator" in text) == told
     other = replace(run, env=replace(env, max_steps=10 * MAX_STEPS))
     assert "max_steps" in problem(replace(row, run=other).sealed())
 

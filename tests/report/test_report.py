@@ -208,7 +208,7 @@ def test_what_was_counted_on_other_starts_is_no_result(tmp_path, painted):
     assert "imagenet-lite · validation starts" in text and "Success from starts<" in text
     assert "900000–900019 (20 starts), the bank for tests: no training uses it" in text
     assert "500000–500019 (20 starts), the bank for validation: choices are made on it" in text
-    assert "of each policy the starts of seeds 500000–500019 or 900000–900019" in text
+    assert "for each policy, the starts of seeds 500000–500019 or 900000–900019" in text
     shutil.rmtree(tmp_path / "evaluations/imagenet-lite-front")
     text = report.write_report(tmp_path).read_text()
     assert "solves 20 of 20 validation starts of grasp" in text

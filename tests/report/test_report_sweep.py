@@ -469,7 +469,7 @@ def test_a_high_level_policy_stands_once_with_its_errors(text):
     counted = [int(frames or 0) for _, frames in cells]
     assert counted == [count for row in STAGE_ERRORS.confusion for count in row]
     assert cells[0] == ("98", "412") and cells[18] == ("94", "377")
-    assert "1910 of 1980 frames named rightly (96 %)" in section
+    assert "1910 of 1980 frames predicted correctly (96 %)" in section
     assert "calibration error 0.012; mean absolute error of the progress 0.046" in section
 
 
@@ -633,7 +633,7 @@ def test_latex_escapes_what_it_would_read_as_a_command():
 def test_markdown_and_csv_hold_the_same_numbers(written, groups):
     lines = (written / "tables/table.md").read_text().splitlines()
     starts = [at for at, line in enumerate(lines) if line.startswith("| ---")]
-    assert len(starts) == 3  # beside the paper, success, without a result
+    assert len(starts) == 3  # next to the paper, success, cells without a result
     for at in starts:
         width = lines[at].count("|")
         block = [line for line in lines[at:] if line.startswith("|")]

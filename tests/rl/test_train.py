@@ -259,7 +259,7 @@ def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, caps
         return capsys.readouterr().err
 
     assert "bc_weight" in refused("sac", "--change", "bc_weight=0.2")
-    assert "no demonstrations" in refused("sac", "--demos", str(demos["grasp"]))
+    assert "does not learn from demonstrations" in refused("sac", "--demos", str(demos["grasp"]))
     assert "give observation relative" in refused("td3-her", "--observation", "state")
     assert "imitation" in refused("sac", "--view", "front")
     assert "several" in refused("td3-her", "--task", "suture")

@@ -325,7 +325,7 @@ def test_two_clients_at_once_pause_the_arm():
 
 def test_the_endoscope_has_a_state_and_stands_still():
     arm = Endoscope("ECM")
-    with pytest.raises(InputError, match="stands still"):
+    with pytest.raises(InputError, match="is fixed"):
         arm.receive("servo_jp", joints((0.0,) * 4), "a", NOW)
     arm.receive("state_command", say("disable"), "a", NOW)
     assert arm.operating.state == "DISABLED"

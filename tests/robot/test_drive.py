@@ -239,7 +239,7 @@ def test_a_whole_procedure_succeeds_as_in_process():
     final = env.data.qpos.copy()
     episode, lines, _, served = drive(Script(rows), "suture", len(rows) + 100)
     assert episode.success
-    assert episode.ended == "the judge sees success"
+    assert episode.ended == "the judge reports success"
     assert episode.steps == len(rows)
     assert np.allclose(served.robot.env.data.qpos, final, atol=1e-3)
     let_go = [line for line in lines if set(line["commands"]) == {"PSM1", "PSM2"}]
@@ -308,7 +308,7 @@ def test_a_dry_run_tells_and_moves_nothing():
     assert served.robot.state("PSM2").setpoint == before
     assert not any(line["sent"] for line in lines)
     assert lines[0]["commands"]["PSM2"]["jaw"] > 0
-    assert any("would be told" in line for line in told)
+    assert any("would be sent to" in line for line in told)
 
 
 def test_nothing_is_sent_while_the_switch_is_not_held():
@@ -447,7 +447,7 @@ def planned(shift=0.0, lead=0.0):
     [
         ([Input("/a", 0.05, 0.1)], ENABLED, 0.0, ""),
         ([Input("/a", 0.2, 0.1)], ENABLED, 0.0, "/a is 0.20 s old"),
-        ([Input("/a", math.inf, 0.1)], ENABLED, 0.0, "/a has never come"),
+        ([Input("/a", math.inf, 0.1)], ENABLED, 0.0, "/a has never arrived"),
         ([], {"PSM2": ("", False)}, 0.0, "silent"),
         ([], {"PSM2": ("PAUSED", True)}, 0.0, "PSM2 is PAUSED"),
         ([], {"PSM2": ("ENABLED", False)}, 0.0, "not homed"),
@@ -472,7 +472,7 @@ def test_a_set_point_may_not_jump_lead_or_race():
         if problem:
             break
         guard.remember(plan, 0.02 * step)
-    assert "would be told to move" in problem
+    assert "would be commanded to move" in problem
 
 
 def test_a_largest_action_of_the_policys_own_step_size_is_allowed():

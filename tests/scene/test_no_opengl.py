@@ -33,7 +33,7 @@ def test_work_that_ends_in_images_is_refused_at_once(verb: str, tmp_path: Path) 
     done = run(verb, "--out", "out", where=tmp_path, **WITHOUT, SURGICAI_VISION_RELEASED=released)
     (line,) = done.stderr.splitlines()
     assert done.returncode == 2, line
-    assert "No image can be drawn: 'egl' gives no OpenGL" in line
+    assert "No image can be drawn: 'egl' provides no OpenGL" in line
     assert "apt-get install --yes --no-install-recommends libegl1 libgl1" in line
     assert not (tmp_path / "out").exists()
 
@@ -73,5 +73,5 @@ def test_what_draws_nothing_runs_without_the_library_that_is_named(tmp_path: Pat
     assert done.returncode == 0, done.stderr
     done = run("render-demos", "--demos", "demos", where=tmp_path, MUJOCO_GL="osmesa")
     assert done.returncode == 2
-    assert "'osmesa' gives no OpenGL (its library is not on this machine)" in done.stderr
+    assert "'osmesa' provides no OpenGL (its library is not on this machine)" in done.stderr
     assert "Traceback" not in done.stderr

@@ -94,7 +94,7 @@ def test_joined_views_are_one_map_with_all_channels(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("other", [(1280,), (40, 14, 14)])
 def test_views_of_other_shapes_cannot_be_joined(other: tuple[int, ...]) -> None:
-    with pytest.raises(InputError, match="join_views is for feature maps of one size"):
+    with pytest.raises(InputError, match="join_views needs feature maps of equal size"):
         BC.make(Recipe(join_views=True), ((40, 28, 28), other))
 
 
@@ -121,7 +121,7 @@ def test_augmentation_is_drawn_from_the_training_seed_and_not_when_acting(tmp_pa
 
 
 def test_recipes_refuse_augmentation_of_what_is_not_fed() -> None:
-    with pytest.raises(InputError, match="proprioception_noise goes with proprioception"):
+    with pytest.raises(InputError, match="proprioception_noise needs proprioception"):
         Recipe(proprioception_noise=0.1, proprioception=False)
     with pytest.raises(InputError, match="privileged off"):
         Recipe(proprioception_noise=0.1, privileged=True)

@@ -78,7 +78,7 @@ def test_what_was_changed_is_refused_in_one_line(
     content = bytearray(changed.read_bytes())
     content[-4] ^= 1
     changed.write_bytes(bytes(content))
-    with pytest.raises(BadFile, match=f"{REPO} holds no policy that can be used: .*{name}") as info:
+    with pytest.raises(BadFile, match=f"{REPO} holds no usable policy: .*{name}") as info:
         pull_policy(REPO, tmp_path / "pulled", api=fake_hub)
     assert "\n" not in str(info.value)
     assert "fetched" not in str(info.value)
@@ -91,7 +91,7 @@ def test_a_changed_value_of_the_card_is_refused(
     push_policy(policy, REPO, api=fake_hub)
     card = json.loads((fake_hub.folder / CARD).read_text())
     (fake_hub.folder / CARD).write_text(json.dumps({**card, "frames": 1_000_000}))
-    with pytest.raises(BadFile, match="hash does not fit"):
+    with pytest.raises(BadFile, match="hash does not match"):
         pull_policy(REPO, tmp_path / "pulled", api=fake_hub)
 
 

@@ -129,13 +129,13 @@ def test_what_does_not_go_together_is_refused(says: Path, fed: Path, tmp_path: P
     dataset = fake_procedures(2)
     for changes, given, words in (
         (("progress_input=true",), None, "--progress-from DIR"),
-        ((), says, "feeds no progress"),
-        (("progress_input=true",), fed, "says no progress"),
+        ((), says, "does not use progress as an input"),
+        (("progress_input=true",), fed, "does not predict progress"),
     ):
         run = replace(RUN, changes=changes)
         with pytest.raises(InputError, match=words):
             train_run(run, dataset, tmp_path / "a", silent_stage, progress_from=given)
-    with pytest.raises(InputError, match="in the place of the clock"):
+    with pytest.raises(InputError, match="replaces the clock"):
         Recipe(progress_input=True, clock=True)
     checkpoint = read_checkpoint(says)
     place = replace(checkpoint, run=replace(checkpoint.run, env=TaskConfig("place")))

@@ -10,7 +10,7 @@ COMMANDS = MappingProxyType(
     {
         "push": "Share a policy on the Hugging Face Hub, with a model card.",
         "pull": "Fetch a policy from the Hugging Face Hub and verify it.",
-        "tune": "Choose how sure and how patient the ends of a hierarchical policy are.",
+        "tune": "Choose how confidently and patiently a hierarchical policy ends subtasks.",
     }
 )
 """Command → what it does, in one line."""

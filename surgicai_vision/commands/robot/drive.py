@@ -49,11 +49,12 @@ app = App(
     help_epilogue="""\
 example:
   surgicai-vision robot drive released:suture --simulated --clock stepped --send
-at the simulation that this serves in another terminal:
+it drives the simulation that this command serves in another terminal:
   surgicai-vision robot serve --task suture --clock stepped --advance told \\
       --view front_psm1,front_psm2,back_psm1,back_psm2
 
-Without --send nothing is sent: it prints what would be. docs/robot.md says what the guards ask.""",
+Without --send nothing is sent: the command prints what it would send. docs/robot.md describes the
+guards.""",
 )
 LOG = "drive.jsonl"
 KEY = "key"
@@ -92,7 +93,7 @@ class Options:
     dead_man: Annotated[
         str | None,
         Parameter(metavar="key|TOPIC|none"),
-        default_text("key, at a served simulation none"),
+        default_text("key; none for a served simulation"),
     ] = None
     episodes: Annotated[int, COUNT] = 1
     seed: Annotated[int, SEED] = names.TEST_SEED
@@ -246,7 +247,7 @@ def _told(
         figures |= {f"{name}_ms_median": median, f"{name}_ms_p99": high}
         if values:
             console.say(
-                f"from the newest {what} to sending: {median:.1f} ms in the median, p99 {high:.1f}."
+                f"from the newest {what} to sending: median {median:.1f} ms, p99 {high:.1f} ms."
             )
     successes = sum(bool(episode.success) for episode in episodes)
     if options.simulated:
@@ -284,7 +285,9 @@ def _dead_man(options: Options, transport: "Transport", stack: ExitStack) -> "Ca
     given = options.dead_man or (NONE if options.simulated else KEY)
     if given == NONE:
         if not options.simulated:
-            raise InputError("--dead-man none is for a served simulation; a person holds a robot.")
+            raise InputError(
+                "--dead-man none is for a served simulation; at a robot, a person holds the switch."
+            )
         return lambda: 0.0
     if given == KEY:
         return stack.enter_context(HeldKey()).age

@@ -78,7 +78,7 @@ class Options:
     ] = 50.0
     compressed: bool = False
     advance: Annotated[str, Parameter(choices=ADVANCES)] = ADVANCES[0]
-    record: Annotated[Path | None, DIRECTORY, default_text("keep nothing")] = None
+    record: Annotated[Path | None, DIRECTORY, default_text("record nothing")] = None
     truth: bool = False
     transport: Annotated[str, TRANSPORT] = "cyclonedds"
     interface: Annotated[str, INTERFACE] = "lo"
@@ -129,7 +129,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         limit = None if options.seconds is None else round(options.seconds * names.FPS)
         with Server(robot, transport, config, recorder) as server:
             reach = (
-                "this machine alone"
+                "this machine only"
                 if options.interface == LOOPBACK
                 else f"everyone on {options.interface} may move the arms"
             )
@@ -145,8 +145,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             late = 1e3 * np.array(server.lateness or [0.0])
         env.close()
     console.say(
-        f"{robot.steps} control steps; they began late by {np.median(late):.2f} ms in the median, "
-        f"{np.percentile(late, 99):.2f} ms at the 99th percentile."
+        f"{robot.steps} control steps; they began late by {np.median(late):.2f} ms (median) and "
+        f"{np.percentile(late, 99):.2f} ms (99th percentile)."
     )
     return {
         "task": options.task,

@@ -131,7 +131,7 @@ def _cluster(workers: int, address: str | None) -> Iterator[ModuleType]:
     try:
         if not address and ray.util.get_node_ip_address() != "127.0.0.1":
             raise SurgicaiError(
-                "Ray listens beyond loopback, since it was imported before; "
+                "Ray listens beyond loopback, because it was imported earlier; "
                 "give its address as an option of the executor."
             )
         yield ray

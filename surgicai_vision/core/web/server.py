@@ -77,7 +77,7 @@ class PageServer:
         self.invitation = (
             f"Open {self.url}",
             f"From another machine: ssh -L {self.port}:{HOST}:{self.port} THIS-MACHINE, "
-            "then open the same there.",
+            "then open the same address there.",
         )
 
     def start(self) -> None:

@@ -104,7 +104,7 @@ def import_drive_log(
         tracks += usable
         skipped += unusable
     if not steps:
-        raise BadFile(f"{path} holds no measured poses; it is no log of robot drive.")
+        raise BadFile(f"{path} holds no measured poses; it is not a log of 'robot drive'.")
     request: dict[str, object] = {
         "drive": hashlib.sha256(path.read_bytes()).hexdigest(),
         "bag": to_mapping(config),
@@ -135,7 +135,7 @@ def _steps(path: Path) -> Iterator[_Step]:
             seed, step, phase = (int(cast(int, row[key])) for key in ("episode", "step", "phase"))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise BadFile(
-                f"{path}, line {number} is none of a log ({first_line(error)})."
+                f"{path}, line {number} is not a line of a log ({first_line(error)})."
             ) from None
         if len(arms) != 2 * SEVEN or not np.isfinite(arms).all():
             raise BadFile(f"{path}, line {number}: both_arms must be {2 * SEVEN} finite numbers.")

@@ -186,8 +186,8 @@ class DatasetFiles:
         self.frames = int(finite_number(info.get("total_frames", 0), f"{file}: total_frames"))
         if version not in VERSIONS or not FPS[0] <= self._fps <= FPS[1]:
             raise BadFile(
-                f"{file}: version {shown(version)}, {self._fps:g} fps; read are "
-                f"{', '.join(VERSIONS)} of {FPS[0]:g} to {FPS[1]:g} fps."
+                f"{file}: version {shown(version)}, {self._fps:g} fps; supported: "
+                f"{', '.join(VERSIONS)} at {FPS[0]:g} to {FPS[1]:g} fps."
             )
         self._index = _elements(path, features)
         self._columns = [names.STATE, "episode_index", "frame_index", "timestamp"]
@@ -244,7 +244,7 @@ class DatasetFiles:
         state = _matrix(table, names.STATE, where)
         if state.shape[1] <= max(map(max, self._index.values())):
             raise BadFile(
-                f"{where}: {names.STATE} has {state.shape[1]} elements, fewer than named."
+                f"{where}: {names.STATE} has {state.shape[1]} elements, fewer than are named."
             )
         time = self._times(table, where)
         arrays: Arrays = {"topics": np.array([names.STATE], dtype=str)}
@@ -294,7 +294,7 @@ def _joined(first: pa.Table, second: pa.Table, where: str) -> pa.Table:
         return pa.concat_tables([first, second])
     except pa.ArrowException as error:
         raise BadFile(
-            f"{where}: its columns are not those of the file before it ({first_line(error)})."
+            f"{where}: its columns differ from those of the previous file ({first_line(error)})."
         ) from None
 
 
@@ -346,8 +346,8 @@ def _elements(path: Path, features: Mapping[str, JSON]) -> dict[str, list[int]]:
         }
     raise InputError(
         f"{path}: {names.STATE} has shape {shape} and elements {', '.join(known) or 'unnamed'}; "
-        f"needed are the poses and jaws of both arms, {', '.join(f'psm1{e}' for e in ELEMENTS[0])} "
-        "and so on."
+        "it must hold the poses and jaws of both arms, "
+        f"{', '.join(f'psm1{e}' for e in ELEMENTS[0])} and so on."
     )
 
 
@@ -366,7 +366,7 @@ def _pose(values: NDArray[np.float64], where: str, what: str) -> NDArray[np.floa
     """Return poses (N, 7), x y z and a unit quaternion w x y z."""
     length = np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
     if (np.abs(length - 1.0) > UNIT_TOLERANCE).any():
-        raise BadFile(f"{where}: a quaternion of {what} is no unit quaternion.")
+        raise BadFile(f"{where}: a quaternion of {what} is not a unit quaternion.")
     return np.hstack([values[:, :3], values[:, 3:] / length])
 
 

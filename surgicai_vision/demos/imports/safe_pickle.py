@@ -118,7 +118,7 @@ class _Array:
         if version != 1 or not isinstance(shape, tuple) or not isinstance(dtype, _Dtype):
             _refuse("an array's state is not what numpy writes")
         if not all(isinstance(side, int) and 0 <= side < 2**40 for side in shape) or len(shape) > 5:
-            _refuse("an array's shape is senseless")
+            _refuse("an array's shape is invalid")
         content = content.encode("latin-1") if isinstance(content, str) else content
         if not isinstance(content, bytes):
             _refuse("an array holds objects, not numbers")
@@ -186,7 +186,7 @@ class _Scalar:
         content = arguments[1].encode("latin-1") if isinstance(arguments[1], str) else arguments[1]
         kind = arguments[0].numpy()
         if not isinstance(content, bytes) or len(content) != kind.itemsize:
-            _refuse(f"a number of type {kind} has another length")
+            _refuse(f"a number of type {kind} has the wrong length")
         number: np.generic = np.frombuffer(content, kind)[0]
         return number
 
@@ -253,8 +253,8 @@ def _inspect(content: bytes) -> None:
         text = str(argument)
         if name not in _OPCODES:
             if name in ("INST", "PERSID", "BINPERSID"):
-                _refuse(f"it names '{text}', and only numpy arrays are admitted")
-            _refuse(f"it makes objects that are no numpy arrays (instruction {name})")
+                _refuse(f"it names '{text}', and only numpy arrays are allowed")
+            _refuse(f"it creates objects that are not numpy arrays (instruction {name})")
         if name in _STRINGS:
             strings = [*strings[-1:], text]
         elif name == "GLOBAL":
@@ -304,6 +304,4 @@ def _refuse(why: str) -> NoReturn:
 
 def _refuse_global(module: str, name: str) -> NoReturn:
     shown = "".join(c if c.isprintable() else "?" for c in f"{module}.{name}")[:80]
-    _refuse(
-        f"it names '{shown}', and only numpy arrays and dtypes are admitted; nothing of it was run"
-    )
+    _refuse(f"it names '{shown}', and only numpy arrays and dtypes are allowed; none of it was run")

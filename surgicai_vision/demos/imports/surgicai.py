@@ -147,7 +147,7 @@ def split(arrays: Mapping[str, NDArray[np.float64]]) -> list[Episode]:
     ends = np.flatnonzero(arrays["done"] > 0.5)
     if not len(ends) or ends[-1] != len(arrays["done"]) - 1:
         raise BadFile(
-            "The recording does not end with a transition that is done; it seems cut off."
+            "The recording does not end with a transition marked done; it seems to be cut off."
         )
     metres = np.array([0.01, 0.01, 0.01, 1.0, 1.0, 1.0, 1.0])
     episodes = []
@@ -158,8 +158,8 @@ def split(arrays: Mapping[str, NDArray[np.float64]]) -> list[Episode]:
         after = arrays["next_observation"][rows]
         if not np.allclose(after[:-1, :7], before[1:, :7], atol=1e-4):
             raise BadFile(
-                f"The recording jumps inside episode {number}: "
-                "a next observation is not the next one."
+                f"The recording jumps inside episode {number}: a next_observation differs from "
+                "the observation that follows."
             )
         if not np.allclose(before[:, 7:14] - before[:, :7], before[:, 14:], atol=1e-3):
             raise BadFile(
@@ -196,14 +196,14 @@ def check_task(episodes: list[Episode], task: str) -> None:
     fits = [name for name in grasps if names.ACTIVE_ARM[name] == arm]
     if task not in fits:
         raise InputError(
-            f"The recording is no {task}: it moves {arm} and begins with its jaw at {jaw:.2f} rad; "
-            f"that fits {' or '.join(fits)}."
+            f"The recording is not of {task}: it moves {arm} and begins with its jaw at "
+            f"{jaw:.2f} rad; that fits {' or '.join(fits)}."
         )
     errors = [grip_error(trimmed(episode, task), task) for episode in episodes]
     if np.median(errors) > 0.0:
         others = " or ".join(name for name in fits if name != task) or "no task"
         raise InputError(
-            f"The recording is no {task}: with its goal the needle would lie "
+            f"The recording is not of {task}: with its goal the needle would lie "
             f"{np.median(errors) * 1e3:.0f} mm outside the jaws; that fits {others}."
         )
 

@@ -129,7 +129,7 @@ def _npz(path: Path) -> dict[str, NDArray[np.float64]]:
             arrays = {name: np.asarray(archive[stored]) for name, stored in names.items()}
         for name, array in arrays.items():
             if array.dtype.kind not in "biuf":
-                raise BadFile(f"{path}: {name} is of type {array.dtype}, no plain numbers.")
+                raise BadFile(f"{path}: {name} is of type {array.dtype}, not plain numbers.")
         return {name: np.asarray(array, np.float64) for name, array in arrays.items()}
     except BadFile:
         raise

@@ -125,7 +125,8 @@ def read_source(path: str) -> Source:
     demo = read_demo(Path(path))
     if demo.demonstrator == NAME:
         raise InputError(
-            f"{path} was multiplied itself; give the demonstrations that it was made from."
+            f"{path} is itself a multiplied demonstration; give the demonstrations that it "
+            "was made from."
         )
     env = envs.make(demo.config)
     if env.scene.hash != demo.scene_hash:

@@ -108,7 +108,7 @@ class _PageOfEnv:
         moment = present_moment(self._env, self._info, self._monitor, self._steps)
         return LiveStatus(
             state=state,
-            message="The env was closed." if state == STOPPED else "Another program steps it.",
+            message="The env was closed." if state == STOPPED else "Another program steps the env.",
             views=self._views.shown,
             episode=self._episode,
             seed=-1,

@@ -66,7 +66,7 @@ _SINGLE: Mapping[str, Axis] = MappingProxyType(
             {"appearance_shift": 1.0},
         ),
         "distractors": Axis(
-            "up to 5 things lie about: a second needle, gauze, a clip, cut thread, blood",
+            "up to 5 objects lie around: a second needle, gauze, a clip, cut thread, blood",
             {"distractors": 5},
         ),
         "smoke": Axis(

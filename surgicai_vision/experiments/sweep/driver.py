@@ -155,7 +155,7 @@ def _stored(experiment: Experiment, out: Path) -> Experiment:
     if stored.kind != experiment.kind or not experiment.extends(stored.table()):
         raise OutputExists(
             f"--out {out} holds another sweep (see {out / GRID_FILE}); give another folder. "
-            "To a plan, training seeds and conditions may be added; the rest must stay."
+            "Training seeds and conditions may be added to a plan; the rest must stay the same."
         )
     return stored
 

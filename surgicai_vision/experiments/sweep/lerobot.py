@@ -85,7 +85,7 @@ def train_lerobot(
     """
     if dataset.fps != names.FPS:
         raise InputError(
-            f"{dataset.path} holds {dataset.fps} frames a second; {run.policy} needs {names.FPS}."
+            f"{dataset.path} holds {dataset.fps} frames per second; {run.policy} needs {names.FPS}."
         )
     root = dataset.path
     if run.encoder != OWN:

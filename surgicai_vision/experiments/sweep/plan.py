@@ -189,7 +189,7 @@ def _check_acts(policy: str) -> None:
         return
     raise InputError(
         f"policy: '{policy}' chooses subtasks and does not act; it is evaluated over a policy for "
-        "each subtask: write `hierarchical:` in place of it (docs/sweeps.md)."
+        "each subtask: write `hierarchical:` instead (docs/sweeps.md)."
     )
 
 

@@ -81,7 +81,7 @@
     const who = `start ${film.start}` + (seed === null ? "" : `, training seed ${seed}`) + `, seen by ${film.view}: `;
     const caption = make("figcaption", {}, who, make("span", { class: won ? "won" : "lost" }, film.outcome));
     const figure = make("figure", { class: "rollout", "data-film": film.id }, caption, frames(film));
-    const pin = make("button", { class: "button pin", type: "button" }, "Set beside others");
+    const pin = make("button", { class: "button pin", type: "button" }, "Add to comparison");
     pin.addEventListener("click", () => {
       const copy = make("figure", { class: "rollout" }, make("figcaption", {}, `${group.task}, ${group.title}: ${who}`,
         make("span", { class: won ? "won" : "lost" }, film.outcome)), frames(film));
@@ -90,7 +90,7 @@
       copy.firstChild.append(off);
       pinned.append(copy);
       pinned.hidden = false;
-      pin.textContent = "Set beside others ✓";
+      pin.textContent = "Added to comparison ✓";
     });
     caption.append(pin);
     return figure;
@@ -145,10 +145,10 @@
     }
     group.cells.forEach((cell, index) => {
       const head = (cell.seed === null ? "" : `Training seed ${cell.seed}: `) + `${cell.count} (${cell.interval})`;
-      const said = make("p", { class: "note said", "aria-live": "polite" }, "One square an episode, in the order of the starts; a ringed one has a film below.");
+      const said = make("p", { class: "note said", "aria-live": "polite" }, "One square per episode, in the order of the starts; a ringed one has a film below.");
       const facts = make("dl");
       for (const [name, value] of cell.facts) facts.append(make("dt", {}, name), make("dd", {}, make("code", {}, value)));
-      const origin = make("details", {}, make("summary", {}, "How to make this number again"),
+      const origin = make("details", {}, make("summary", {}, "How to reproduce this number"),
         ...cell.commands.map(command => make("code", { class: "command" }, command)), facts);
       body.append(make("section", {}, make("h3", {}, head), squares(group, cell, index), said, origin));
     });

@@ -79,7 +79,10 @@ class Appearance:
         for family in filter(None, (self.family, self.other)):
             check_name("appearance", family, names.APPEARANCES)
         if self.share and not self.other:
-            raise InputError(f"An appearance with a share of {self.share} of no other one.")
+            raise InputError(
+                f"An appearance has share {self.share} of another one, but names no other; give "
+                "other."
+            )
 
     @property
     def numbers(self) -> tuple[float, ...]:

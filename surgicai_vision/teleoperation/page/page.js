@@ -127,7 +127,7 @@ function showStatus(status) {
 function showLost() {
   element("message").className = "lost";
   setText("state", "no connection");
-  setText("text", "The session has ended, or the line is down.");
+  setText("text", "The session has ended, or the network is down.");
 }
 
 follow(showStatus, showLost);

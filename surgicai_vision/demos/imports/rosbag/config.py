@@ -250,8 +250,8 @@ class BagConfig:
         if key not in table:
             shown = printable(label)
             raise InputError(
-                f"The recording has the label '{shown}'; "
-                f"known are {', '.join(filter(None, table))}. Say what it means in the file of "
-                f"--config: `bag: {{labels: {{'{shown}': grasp}}}}`, or none."
+                f"The recording has the label '{shown}'; known labels: "
+                f"{', '.join(filter(None, table))}. Map it to a subtask in the --config file: "
+                f"`bag: {{labels: {{'{shown}': grasp}}}}`, or to none."
             )
         return table[key]

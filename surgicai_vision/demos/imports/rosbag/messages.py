@@ -126,8 +126,8 @@ def layout_of(kind: str, *, ros1: bool, text: str = "") -> Layout:
     """
     if kind not in DEFINITIONS:
         raise BadFile(
-            f"messages of type {printable(kind)} are not read; "
-            f"known are {', '.join(sorted(DEFINITIONS))}."
+            f"messages of type {printable(kind)} are not supported; supported types: "
+            f"{', '.join(sorted(DEFINITIONS))}."
         )
     own = text.split("\n====", 1)[0] if kind in AMBF else ""
     return tuple(_flatten(own if own.strip() else DEFINITIONS[kind], "", ros1))
@@ -147,11 +147,13 @@ def _flatten(text: str, prefix: str, ros1: bool) -> list[Field]:
             fields += _flatten(DEFINITIONS[plain], f"{prefix}{name}.", ros1)
         else:
             raise BadFile(
-                f"a message definition has a field of type {printable(kind)}, which is not read."
+                f"a message definition has a field of type {printable(kind)}, which is not "
+                "supported."
             )
     if len(fields) > MAX_FIELDS:
         raise BadFile(
-            f"a message definition has {len(fields)} fields; above {MAX_FIELDS} are not read."
+            f"a message definition has {len(fields)} fields; definitions with more than "
+            f"{MAX_FIELDS} are not read."
         )
     return fields
 
@@ -160,7 +162,8 @@ def _lines(text: str) -> list[tuple[str, str]]:
     """Return (type, name) of each field of a definition; comments and constants are left out."""
     if len(text) > MAX_TEXT:
         raise BadFile(
-            f"a message definition has {len(text)} characters; above {MAX_TEXT} are not read."
+            f"a message definition has {len(text)} characters; definitions with more than "
+            f"{MAX_TEXT} are not read."
         )
     pairs = []
     for line in text.splitlines():
@@ -169,8 +172,8 @@ def _lines(text: str) -> list[tuple[str, str]]:
             continue
         if len(words) < 2 or not words[1].isidentifier():
             raise BadFile(
-                f"a message definition has the line '{printable(line.strip())}', "
-                "which is no 'type name'."
+                f"a message definition has the line '{printable(line.strip())}', which is not of "
+                "the form 'type name'."
             )
         pairs.append((words[0], words[1]))
     return pairs
@@ -207,7 +210,7 @@ class _Cursor:
         self._start = 0
         if not ros1:
             if len(data) < 4 or data[:2] not in (b"\0\0", b"\0\1"):
-                raise ValueError("no plain CDR")
+                raise ValueError("not plain CDR")
             self._order = "<" if data[1] else ">"
             self._start = 4
         self._offset = self._start
@@ -222,7 +225,7 @@ class _Cursor:
             )
         count = self._count()
         if count > len(self._data) - self._offset:
-            raise ValueError(f"a sequence of {count} in {len(self._data)} bytes")
+            raise ValueError(f"a sequence of {count} elements in {len(self._data)} bytes")
         if field.kind == STRING:
             return tuple(self._text() for _ in range(count))
         return self._numbers(PRIMITIVES[field.kind], count) if count else ()
@@ -251,7 +254,7 @@ class _Cursor:
         count = self._count()
         end = self._offset + count
         if end > len(self._data):
-            raise ValueError(f"a text of {count} in {len(self._data)} bytes")
+            raise ValueError(f"a text of {count} bytes in a message of {len(self._data)} bytes")
         text = self._data[self._offset : end].decode()
         self._offset = end
         return text.removesuffix("\0")

@@ -182,7 +182,9 @@ def _fill(
             message = decode(data, layouts[connection.topic], ros1=ros1)
         except ValueError as error:
             kind = printable(_plain(connection.msgtype))
-            raise BadFile(f"a message on {connection.topic} is no {kind} ({error}).") from None
+            raise BadFile(
+                f"a message on {connection.topic} is not of type {kind} ({error})."
+            ) from None
         for column in columns_of[connection.topic]:
             column.add(time, message)
 
@@ -194,8 +196,8 @@ def _check_kind(connection: Connection, topics: Mapping[str, str]) -> None:
         allowed = KINDS[role.rsplit("_", 1)[-1]]
         if topic == connection.topic and kind not in allowed:
             raise InputError(
-                f"{topic} ({role}) holds {printable(kind)}; "
-                f"{role} is read from {', '.join(allowed)}."
+                f"{topic} ({role}) holds {printable(kind)}; types allowed for {role}: "
+                f"{', '.join(allowed)}."
             )
 
 
@@ -256,7 +258,7 @@ class _Column:
         if self._width == 7:
             lengths = np.linalg.norm(value[:, 3:], axis=1)
             if np.abs(lengths - 1.0).max() > UNIT_TOLERANCE:
-                raise BadFile(f"{self._where} holds rotations that are no unit quaternions.")
+                raise BadFile(f"{self._where} holds rotations that are not unit quaternions.")
             value[:, 3:] /= lengths[:, None]
         return {
             f"{self._name}.time": np.array(self.times),
@@ -317,8 +319,8 @@ def _inspect(path: Path) -> None:
         raise BadFile(f"Cannot read {path}: no such file.")
     if not is_bag(path):
         raise BadFile(
-            f"{path} is no bag; a bag is a file ending in {', '.join(ENDINGS)} "
-            f"or a folder with {METADATA}."
+            f"{path} is not a bag; a bag is a file ending in {', '.join(ENDINGS)} or a folder "
+            f"with {METADATA}."
         )
     if path.is_dir():
         _inspect_metadata(path / METADATA)
@@ -333,15 +335,15 @@ def _inspect_metadata(path: Path) -> None:
     """Check a folder's description before `rosbags` parses it: YAML is slow on deep brackets."""
     size = path.stat().st_size
     if size > MAX_METADATA:
-        raise BadFile(f"{path} has {size} bytes; above {MAX_METADATA} are not read.")
+        raise BadFile(f"{path} has {size} bytes; files above {MAX_METADATA} bytes are not read.")
     text = path.read_text(encoding="utf-8", errors="replace")
     opened = itertools.accumulate(1 if mark in "[{" else -1 for mark in re.findall(r"[][{}]", text))
     if "rosbag2_bagfile_information:" not in text or max(opened, default=0) > MAX_DEPTH:
-        raise BadFile(f"{path} is no description of a ROS 2 bag.")
+        raise BadFile(f"{path} is not the description of a ROS 2 bag.")
     if re.search(r"compression_mode\W+file\b", text, re.IGNORECASE):
         raise BadFile(
-            f"{path.parent} is packed file by file; "
-            "unpack it first (zstd -d, then `ros2 bag reindex`)."
+            f"{path.parent} is compressed file by file; decompress it first (zstd -d, then `ros2 "
+            "bag reindex`)."
         )
 
 

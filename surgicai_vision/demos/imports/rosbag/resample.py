@@ -98,8 +98,8 @@ def resample(arrays: Arrays, config: BagConfig, instrument: str) -> Recording:
     begin = max(times[role].min() for role in steady)
     end = min(times[role].max() for role in steady)
     overlap = (
-        f"The topics overlap in {(end - begin) / 1e9:.1f} s; "
-        f"that must be above 0 and at most {MAX_DURATION:.0f} s."
+        f"The topics overlap for {(end - begin) / 1e9:.1f} s; that must be above 0 and at most "
+        f"{MAX_DURATION:.0f} s."
     )
     if not begin < end:
         raise NothingShown(overlap)
@@ -168,7 +168,7 @@ def _roles(arrays: Arrays, config: BagConfig) -> list[str]:
         wanted = ", ".join(config.all_topics[f"{arm}_pose"] for arm in names.ARMS)
         there = topic_list(arrays["topics"].tolist(), wanted)
         raise InputError(
-            f"The recording has the pose of no arm: none of {wanted}. The topics are {there}."
+            f"The recording has no arm's pose: it has none of {wanted}. The topics are {there}."
         )
     return [*roles, "needle"] if "needle.value" in arrays else roles
 
@@ -182,7 +182,7 @@ def _times(arrays: Arrays, config: BagConfig) -> dict[str, NDArray[np.int64]]:
     if config.clock == "bag" or (config.clock == "auto" and not stamped):
         return times
     if not stamped:
-        raise InputError("clock is 'stamp', but the messages have no stamps; take 'bag' or 'auto'.")
+        raise InputError("clock is 'stamp', but the messages have no stamps; use 'bag' or 'auto'.")
     late = np.concatenate([times[role] - stamps[role] for role in stamped])
     shift = int(np.median(late))
     return {**times, **{role: stamps[role] + shift for role in stamped}}
@@ -254,8 +254,8 @@ def _tip(
     if not placed and any(part in frame for part in ENDOSCOPE_FRAMES):
         raise InputError(
             f"{config.all_topics[role]} is in frame '{printable(frame)}', not in {arm}'s base. "
-            f"Take the topic that is (dVRK: /{arm.upper()}/local/measured_cp), "
-            f"or give the frame's pose in the base as frames: {arm}."
+            f"Use a topic that is in the base (dVRK: /{arm.upper()}/local/measured_cp), or give "
+            f"the frame's pose in the base as frames: {arm}."
         )
     scaled = values * np.array([config.length_scale] * 3 + [1.0] * 4)
     return (

@@ -97,8 +97,8 @@ def segments(
     if method == NOTHING:
         if task is None:
             raise InputError(
-                "The recording has no labels and no needle to segment it by: "
-                "say what it shows (--task)."
+                "The recording has neither labels nor a needle pose to segment it by; say what "
+                "it shows (--task)."
             )
         return [Segment(task, 0, len(recording) - 1)]
     found = _by_labels(recording, config) if method == "labels" else _by_events(recording, pair)
@@ -114,7 +114,8 @@ def segments(
 def _by_labels(recording: Recording, config: BagConfig) -> list[Segment]:
     if recording.label is None:
         raise InputError(
-            f"The recording has no labels; wanted is the topic {config.all_topics['label']}."
+            "The recording has no labels; they are expected on the topic "
+            f"{config.all_topics['label']}."
         )
     meaning = {label: config.subtask_of(str(label)) for label in np.unique(recording.label)}
     subtasks = np.array([meaning[label] for label in recording.label])

@@ -205,7 +205,7 @@ def _inferred(
     """Return T_world_needle (T + 1, 4, 4) where the task's definition puts an unrecorded needle."""
     if (base.scene.layout, base.scene.hole_pair) != ("simple", 1):
         raise InputError(
-            "A bag without the needle's pose can be replayed at hole pair 1 of layout simple alone."
+            "A bag without the needle's pose can be replayed only at hole pair 1 of layout simple."
         )
     rpy = np.unwrap([matrix_to_rpy(pose[:3, :3]) for pose in tip], axis=0)
     poses = np.column_stack([tip[:, :3, 3], rpy, jaw])

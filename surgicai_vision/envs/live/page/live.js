@@ -216,7 +216,7 @@ function drawCurve(id, column, colour, least) {
 function showLost() {
   element("message").className = "lost";
   setText("state", "no connection");
-  setText("text", "The session has ended, or the line is down.");
+  setText("text", "The session has ended, or the network is down.");
 }
 
 follow(showStatus, showLost);
