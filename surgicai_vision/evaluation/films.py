@@ -10,10 +10,10 @@ folder that holds it may be filmed into again; the videos it lists are removed f
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,8 +103,12 @@ class Filming:
                 f"Videos of '{self.of}'; allowed: {', '.join(CHOICES)}, or a number of starts."
             )
 
-    def begun(self, seeds: Sequence[int]) -> "Filming":
+    def begun(self, seeds: Sequence[int], kept: Collection[int] = ()) -> "Filming":
         """Return this filming for an evaluation of `seeds`; earlier videos are removed.
+
+        Args:
+            seeds: the starts, in order.
+            kept: starts whose episodes were run and filmed before; their videos stay.
 
         Raises:
             OutputExists: the folder holds other files.
@@ -112,15 +116,21 @@ class Filming:
         files.check_output(self.folder, may_resume=INDEX, option="--video")
         self.folder.mkdir(parents=True, exist_ok=True)
         if (self.folder / INDEX).exists():
-            for name in self.videos():
-                (self.folder / name).unlink(missing_ok=True)
+            for row in self._listed():
+                if row["seed"] not in kept:
+                    (self.folder / Path(row["file"]).name).unlink(missing_ok=True)
         files.write_json(self.folder / INDEX, {"videos": []})
         count = int(self.of) if self.of.isdecimal() else 0
         return dataclasses.replace(self, first=tuple(int(seed) for seed in seeds[:count]))
 
     def videos(self) -> list[str]:
         """Return the names of the videos in the folder's list."""
-        return [Path(row["file"]).name for row in files.read_json(self.folder / INDEX)["videos"]]
+        return [Path(row["file"]).name for row in self._listed()]
+
+    def _listed(self) -> list[dict[str, Any]]:
+        """Return the rows of the folder's list."""
+        rows: list[dict[str, Any]] = files.read_json(self.folder / INDEX)["videos"]
+        return rows
 
     def wants(self, row: EpisodeMetrics) -> bool:
         """Return True if an episode is to become a video."""

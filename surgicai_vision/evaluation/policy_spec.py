@@ -78,12 +78,15 @@ class PolicySpec:
         about: what else is stored with the result: hashes and folders.
         training: what distinguishes it from others of its name in folder names: its training seed,
             or the beginning of a hash where that is not known; empty where there are no others.
+        resumes: whether an evaluation that was killed keeps its finished episodes. A user's own
+            function has no version that would tell whether they are still its own.
     """
 
     run: RunConfig
     make: MakeAgent
     about: Mapping[str, JSON] = field(default_factory=dict)
     training: str = ""
+    resumes: bool = True
 
     @property
     def name(self) -> str:
@@ -254,7 +257,7 @@ def _from_factory(target: str, config: TaskConfig) -> PolicySpec:
     agent = make_from_factory(target)
     encoder = OWN if agent.cameras else None
     run = RunConfig(config, encoder, agent.cameras, policy=target)
-    return PolicySpec(run, functools.partial(make_from_factory, target))
+    return PolicySpec(run, functools.partial(make_from_factory, target), resumes=False)
 
 
 def make_from_factory(target: str) -> Agent:

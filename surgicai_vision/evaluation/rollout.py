@@ -20,6 +20,7 @@ from surgicai_vision.core.progress import Progress
 from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.evaluation.agent import MakeAgent
 from surgicai_vision.evaluation.films import Filming
+from surgicai_vision.evaluation.finished import FinishedEpisodes
 from surgicai_vision.evaluation.slot import Episode, Slot
 
 BATCH = 8
@@ -54,6 +55,7 @@ def evaluate(
     progress: Progress | None = None,
     filming: Filming | None = None,
     upset: bool = False,
+    finished: FinishedEpisodes | None = None,
 ) -> list[Episode]:
     """Run one episode for each seed and return them in the order of `seeds`.
 
@@ -67,6 +69,8 @@ def evaluate(
         filming: which episodes become videos, written by the process that ran them; None films
             nothing.
         upset: let one thing go wrong in every episode (`envs.upset`), drawn from its seed.
+        finished: keeps each episode as it ends, and has those that need not run again; None keeps
+            none.
 
     Raises:
         InputError: seeds that `check_seeds` refuses, numbers below 1, or upsets in a task that has
@@ -77,24 +81,34 @@ def evaluate(
     check_seeds(seeds)
     if batch < 1 or (workers is not None and workers < 1):
         raise InputError(f"batch is {batch} and workers {workers}; both must be at least 1.")
-    count = workers or min(len(os.sched_getaffinity(0)), -(-len(seeds) // 4))
-    shares = [list(seeds[index::count]) for index in range(min(count, len(seeds)))]
+    kept = finished.read(seeds) if finished else {}
+    left = [seed for seed in seeds if seed not in kept]
+    count = workers or min(len(os.sched_getaffinity(0)), -(-len(left) // 4))
+    shares = [left[index::count] for index in range(min(count, len(left)))]
     total = len(seeds) * task_config.max_steps
     if filming is not None:
-        filming = filming.begun(seeds)
+        filming = filming.begun(seeds, kept)
+
+    def report(done: int) -> None:
+        if progress:
+            progress(len(kept) * task_config.max_steps + done, total)
+
     jobs = [
         functools.partial(
-            run_share, make_agent, task_config, share, batch, filming=filming, upset=upset
+            run_share,
+            make_agent,
+            task_config,
+            share,
+            batch,
+            filming=filming,
+            upset=upset,
+            finished=finished,
         )
         for share in shares
     ]
-    if len(jobs) == 1:
-        results = [jobs[0](report=lambda done: progress(done, total) if progress else None)]
-    else:
-        results = _in_processes(jobs, progress, total)
-        if progress:
-            progress(total, total)
-    by_seed = {episode.row.seed: episode for share in results for episode in share}
+    results = [job(report=report) for job in jobs] if len(jobs) < 2 else _in_processes(jobs, report)
+    report(len(left) * task_config.max_steps)
+    by_seed = kept | {episode.row.seed: episode for share in results for episode in share}
     episodes = [by_seed[seed] for seed in seeds]
     if filming is not None:
         filming.finish(episodes)
@@ -109,6 +123,7 @@ def run_share(
     report: Callable[[int], None],
     filming: Filming | None = None,
     upset: bool = False,
+    finished: FinishedEpisodes | None = None,
 ) -> list[Episode]:
     """Run the episodes of one process.
 
@@ -118,7 +133,7 @@ def run_share(
     slots = [
         Slot(index, agent, task_config, upset=upset) for index in range(min(batch, len(seeds)))
     ]
-    waiting, finished = list(seeds)[::-1], []
+    waiting, ended = list(seeds)[::-1], []
     for slot in slots:
         slot.begin(waiting.pop())
     while running := [slot for slot in slots if slot.seed is not None]:
@@ -133,29 +148,31 @@ def run_share(
                 slot.step(action)
         for slot in running:
             if slot.ended:
-                finished.append(slot.take())
+                ended.append(slot.take())
                 if filming is not None:
-                    filming.film(task_config, finished[-1].row, slot.states, slot.moments)
+                    filming.film(task_config, ended[-1].row, slot.states, slot.moments)
+                if finished is not None:
+                    finished.keep(ended[-1])
                 if waiting:
                     slot.begin(waiting.pop())
         report(
-            len(finished) * task_config.max_steps
+            len(ended) * task_config.max_steps
             + sum(slot.steps for slot in slots if slot.seed is not None)
         )
     for slot in slots:
         slot.env.close()
-    return finished
+    return ended
 
 
 def _in_processes(
-    shares: Sequence[Callable[..., list[Episode]]], progress: Progress | None, total: int
+    shares: Sequence[Callable[..., list[Episode]]], report: Callable[[int], None]
 ) -> list[list[Episode]]:
     """Run each share in its own process."""
     try:
         return processes.run_all(
             shares,
             "the evaluation",
-            lambda done: progress(sum(done), total) if progress else None,
+            lambda done: report(sum(done)),
             {"LP_NUM_THREADS": "0"},  # the agents keep torch to one thread
         )
     except processes.Died:

@@ -4,11 +4,14 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from surgicai_vision.core.config import digest, to_mapping
+from surgicai_vision.core.files import code_version
 from surgicai_vision.core.progress import Progress, Stage
 from surgicai_vision.evaluation.films import Filming
+from surgicai_vision.evaluation.finished import FinishedEpisodes
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.provenance import command_line, provenance
-from surgicai_vision.evaluation.rollout import evaluate
+from surgicai_vision.evaluation.rollout import check_seeds, evaluate
 from surgicai_vision.evaluation.storage import (
     MARKER,
     Row,
@@ -56,7 +59,14 @@ def evaluate_into(
     Raises:
         InputError: another process evaluates into `out`.
     """
+    check_seeds(seeds)
+    run = dataclasses.replace(spec.run, starts=Starts(int(seeds[0]), len(seeds)))
+    scene_hash = build_scene(spec.config.scene).hash
     with alone_in(out):
+        finished = None
+        if spec.resumes:
+            owner = [to_mapping(run), dict(spec.about), scene_hash, code_version(), repr(filming)]
+            finished = FinishedEpisodes.open(out, digest(owner))
         episodes = evaluate(
             spec.make_agent,
             spec.config,
@@ -65,12 +75,15 @@ def evaluate_into(
             progress=progress,
             filming=filming,
             upset=spec.run.upset,
+            finished=finished,
         )
         about = {
             "command": command_line(),
             "provenance": provenance(),
-            "scene_hash": build_scene(spec.config.scene).hash,
+            "scene_hash": scene_hash,
             **spec.about,
         }
-        run = dataclasses.replace(spec.run, starts=Starts(int(seeds[0]), len(seeds)))
-        return write_evaluation(out, episodes, run, about)
+        result = write_evaluation(out, episodes, run, about)
+        if finished:
+            finished.remove()
+        return result

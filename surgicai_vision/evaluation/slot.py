@@ -202,13 +202,13 @@ class Slot:
             slip_deg=math.degrees(monitor.turn),
             tissue_force_n=monitor.tissue_force,
             tissue_impulse_ns=monitor.tissue_impulse,
-            tears=monitor.tears,
+            tears=float(monitor.tears),
             thread_mm=1e3 * monitor.thread_drawn,
             paper_success=monitor.paper_success and not self.error,
             upset=self._mishap.kind,
             upset_step=self._mishap.step,
             recovered=success and bool(self._mishap.kind),
-            false_ends=sum(visit.is_false_end for visit in visits) if watch else math.nan,
+            false_ends=float(sum(visit.is_false_end for visit in visits)) if watch else math.nan,
             end_delay_s=statistics.median(delays) if delays else math.nan,
         )
         self.seed = None

@@ -21,6 +21,7 @@ from surgicai_vision.core.config import JSON, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, first_line, shown
 from surgicai_vision.core.untrusted import checked
 from surgicai_vision.envs.visits import LAST, Visit
+from surgicai_vision.evaluation.finished import FOLDER as FINISHED
 from surgicai_vision.evaluation.metrics import (
     KINDS,
     EpisodeMetrics,
@@ -37,7 +38,7 @@ FILMS = "films.safetensors"
 VISITS = "visits.parquet"
 LOCK = "evaluation.lock"
 """Held while a process evaluates into the folder."""
-OURS = (MARKER, EPISODES, FILMS, VISITS, LOCK)
+OURS = (MARKER, EPISODES, FILMS, VISITS, LOCK, FINISHED)
 """Every file of an evaluation; a killed evaluation leaves some of them without the marker."""
 RUN_FILE = "run.json"
 GRID_FILE = "sweep.json"
