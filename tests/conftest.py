@@ -1,6 +1,6 @@
-"""What every test stands on.
+"""Set-up that all tests share.
 
-A headless GL, no network, few threads, and the recordings where present.
+Headless GL, no network, few threads, and the recordings where present.
 """
 
 import os
@@ -30,7 +30,7 @@ def root() -> Path:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of recordings beside the checkout; not every machine has it."""
+    """The folder of recordings next to the checkout; not every machine has it."""
     folder = ROOT.parent / "shared"
     if not folder.is_dir():
         pytest.skip(f"no recordings: {folder} is not here")
@@ -39,16 +39,17 @@ def shared() -> Path:
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep features of tests out of the user's cache."""
+    """Keep the tests' features out of the user's cache."""
     monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 @pytest.fixture(autouse=True)
 def own_schedule() -> Iterator[None]:
-    """Undo what LeRobot's recording does to a process that is root's.
+    """Undo what LeRobot's recording does to a process that runs as root.
 
     Its SVT-AV1 makes the thread a real-time one, and every later test of this process would keep a
-    core from the tests beside it.
+    core from the tests that run alongside.
+
     """
     with processes.kept_schedule():
         yield

@@ -1,4 +1,4 @@
-"""The command line: help, wrong input in one line, options from files, exit codes."""
+"""The command line: help, one-line errors for wrong input, options from files, exit codes."""
 
 import dataclasses
 import io
@@ -40,7 +40,7 @@ def own_folder(tmp_path, monkeypatch):
 
 
 def fails(capsys, *arguments):
-    """Run a command that must end with 2, one line and no traceback; return the line."""
+    """Run a command that must exit with 2, one line and no traceback; return the line."""
     code = main(list(arguments))
     captured = capsys.readouterr()
     assert code == 2, captured.err

@@ -1,4 +1,4 @@
-"""Shell completion: the scripts name every command, and bash completes with its own."""
+"""Shell completion: each script names every command, and bash completes with its script."""
 
 import shutil
 import subprocess

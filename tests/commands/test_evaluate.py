@@ -1,4 +1,4 @@
-"""`evaluate` and its figures: default folders are told apart, and what is killed loses nothing."""
+"""`evaluate` and its figures: default folders are distinct, and a killed command loses nothing."""
 
 import json
 from dataclasses import replace

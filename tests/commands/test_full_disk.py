@@ -1,4 +1,4 @@
-"""A full disk is one line, and costs the item in flight alone."""
+"""A full disk gives a one-line error and costs only the item in progress."""
 
 import errno
 import json
@@ -19,7 +19,7 @@ def test_a_full_disk_is_one_line_and_work_goes_on_once_there_is_room(
     written = os.fsync
 
     def full(file):
-        if any(tmp_path.rglob("*.safetensors")):  # no room for the marker of what was recorded
+        if any(tmp_path.rglob("*.safetensors")):  # no room for the marker of the recording
             raise OSError(code, os.strerror(code))
         written(file)
 

@@ -1,4 +1,4 @@
-"""Banks of starts: each seed belongs to one, and demonstrations begin in theirs alone."""
+"""Banks of starts: each seed belongs to one bank, and demonstrations use training starts only."""
 
 import pytest
 
@@ -30,7 +30,7 @@ def test_every_seed_belongs_to_one_bank():
 def test_demonstrations_begin_from_training_starts():
     check_training_starts(499_998, 2)
     last = first_seed(TRAINING_SEEDS - 1)
-    check_training_starts(last, SEEDS_EACH)  # whatever a plan records
+    check_training_starts(last, SEEDS_EACH)  # the highest seeds of any plan
     for seed, episodes in ((499_999, 2), (500_000, 1), (900_000, 1), (0, 900_000)):
         with pytest.raises(InputError, match=f"seed {seed} on, {episodes} of them"):
             check_training_starts(seed, episodes)

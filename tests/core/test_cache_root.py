@@ -1,4 +1,4 @@
-"""Where the cache lies, whoever's home it is."""
+"""Where the cache is, with and without a home folder."""
 
 from pathlib import Path
 

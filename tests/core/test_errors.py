@@ -1,4 +1,4 @@
-"""Errors: what the checks let through, and that their message says what was given and allowed."""
+"""Errors: what the checks accept, and that messages state the given and the allowed values."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The executor: the store is the truth, whatever becomes of the processes."""
+"""The executor: the store is authoritative, whatever happens to the processes."""
 
 import importlib
 import importlib.util
@@ -207,7 +207,7 @@ def test_building_nothing_leaves_nothing(tmp_path):
 
 
 def listening():
-    """Return where this machine listens for TCP besides loopback, in the kernel's spelling."""
+    """Return the non-loopback TCP addresses this machine listens on, in the kernel's notation."""
     lines = [
         line.split()
         for name in ("tcp", "tcp6")
@@ -222,10 +222,10 @@ def listening():
 
 
 def test_ray_runs_the_same_jobs_on_loopback_and_replaces_a_killed_worker(tmp_path, monkeypatch):
-    """One cluster for all of it: starting Ray takes seconds."""
+    """One cluster serves all checks: starting Ray takes seconds."""
     if (
         importlib.util.find_spec("ray") is None
-    ):  # found, not imported: the engine sets what it listens on
+    ):  # looked up, not imported: the engine sets what it listens on
         pytest.skip("Ray is an extra: surgicai-vision[ray]")
     monkeypatch.setenv(
         "PYTHONPATH", str(Path(__file__).parents[1] / "helpers")
@@ -275,7 +275,7 @@ def test_slurm_is_looked_for_before_any_job(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("cluster", ["debug", "local"])
 def test_slurm_runs_the_same_jobs(tmp_path, monkeypatch, cluster):
-    """The debug executor runs them in this process, the local one makes a process of each."""
+    """The debug executor runs them in this process, the local one starts a process per job."""
     monkeypatch.setenv("PYTHONPATH", str(Path(fake_jobs.__file__).parent))
     store = tmp_path / "store"
     context = RunContext(2, SlurmEngine(cluster=cluster))

@@ -1,4 +1,4 @@
-"""What a config is known by."""
+"""The identity of a config: fields added later are left out until they are used."""
 
 import dataclasses
 

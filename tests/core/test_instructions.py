@@ -1,4 +1,4 @@
-"""Instructions: every task in several sentences, the held-out ones never told in training."""
+"""Instructions: several sentences per task; held-out ones are never used in training."""
 
 import itertools
 
@@ -29,7 +29,7 @@ def test_no_sentence_tells_two_tasks() -> None:
     told = [text for texts in PARAPHRASES.values() for text in itertools.chain(*texts)]
     told += names.TASK_TEXTS.values()
     assert len(set(told)) == len(told)
-    # What a policy must read, the arm, is in every sentence of the two tasks that differ by it.
+    # Every sentence of the two tasks that differ in the arm names it: a policy must read it.
     for task, side in (("grasp", "right"), ("handoff", "left")):
         for text in (*instructions(task, TRAIN), *instructions(task, HELDOUT)):
             assert side in text and {"right": "left", "left": "right"}[side] not in text

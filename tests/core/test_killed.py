@@ -1,4 +1,4 @@
-"""Every command that starts processes is killed, and nothing of it is alive five seconds later."""
+"""Every command that starts processes is killed; `GONE_S` later none of its processes is alive."""
 
 import os
 import signal
@@ -15,7 +15,7 @@ from surgicai_vision.dataset import render_demos
 from surgicai_vision.demos.record import record
 
 GONE_S = 30.0
-"""Longest that anything may be alive after the kill [s]."""
+"""Longest time that a process may outlive the kill [s]."""
 
 VECTOR_ENV = """
 if __name__ == "__main__":
@@ -50,7 +50,7 @@ VERBS = {
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
-    """What the verbs read."""
+    """The inputs of the commands."""
     folder = tmp_path_factory.mktemp("given")
     record(TaskConfig("grasp"), episodes=2, out=folder / "demos", context=RunContext(0))
     render_demos(
@@ -71,7 +71,7 @@ def command(verb, given, out):
 
 
 def parents():
-    """Return every process's parent, and when it started: (pid, start) → parent's pid."""
+    """Return the parent of every process: (pid, start time) → parent's pid."""
     found = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -114,10 +114,10 @@ def kill_and_look(started, number, delay):
 
 @pytest.mark.parametrize("verb", [*VERBS, "vector env"])
 def test_nothing_outlives_a_killed_command(tmp_path, given, verb):
-    """Killed as soon as it has a child, which may still start, and while that one works."""
+    """Kill as soon as there is a child, which may still be starting, and while it works."""
     run = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": tmp_path}
     run["env"] = {**os.environ, "TMPDIR": str(tmp_path)}  # a killed process leaves its files there
-    short = verb == "import-demos"  # its child lives for a moment only
+    short = verb == "import-demos"  # its child lives only briefly
     for number, delay in ((signal.SIGTERM, 0), (signal.SIGKILL, 0 if short else 1)):
         started = subprocess.Popen(command(verb, given, tmp_path / str(number)), **run)
         try:

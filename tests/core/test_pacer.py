@@ -1,4 +1,4 @@
-"""Pacer: what it asks for, what is reached, and how it changes over."""
+"""Pacer: the requested pace, the pace reached, and changes of pace."""
 
 import pytest
 from told_clock import Clock

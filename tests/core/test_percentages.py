@@ -1,4 +1,4 @@
-"""Percentages: what is nearly all is not called all, and an interval has two ends."""
+"""Percentages: nearly all is not shown as all, and an interval has two distinct ends."""
 
 from surgicai_vision.core.percentages import interval, percent
 from surgicai_vision.evaluation.statistics import clopper_pearson

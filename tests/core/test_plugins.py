@@ -1,4 +1,4 @@
-"""Plug-ins: our parts, registered ones, those of other distributions, and collisions of names."""
+"""Plug-ins: our own parts, registered ones, those of other distributions, and name collisions."""
 
 import dataclasses
 import sys
@@ -25,7 +25,7 @@ GROUP = "surgicai_vision.numbers"
 
 
 def install(folder: Path, name: str, points: str) -> None:
-    """Lay down the metadata of an installed distribution, as pip does."""
+    """Write the metadata of an installed distribution, as pip does."""
     info = folder / f"{name}-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
@@ -144,7 +144,7 @@ PARTS: dict[str, tuple[Callable[[], object], str]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """A dataclass that is no recipe."""
+    """A dataclass that is not a recipe."""
 
 
 class Abstract(Subtask):

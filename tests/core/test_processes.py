@@ -27,7 +27,7 @@ def is_alive(pid):
 
 
 def silent(done):
-    """Hear nothing."""
+    """Ignore the progress."""
 
 
 def test_calls_run_at_once_and_come_back_in_order(monkeypatch):
@@ -95,7 +95,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("then", ["child.connection.recv()", "pass"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_grandchildren_end_with_their_grandparent(tmp_path, number, then):
-    """Of a process that is killed, and of one that ends without ending its children."""
+    """Holds for a killed process and for one that ends without ending its children."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(then=then))
     environment = {**os.environ, **HELPERS}

@@ -1,4 +1,4 @@
-"""YAML files of a user: every reader refuses the same ones, in one line."""
+"""YAML files from users: every reader refuses the same files, with one-line errors."""
 
 from collections.abc import Callable
 from pathlib import Path

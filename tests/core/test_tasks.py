@@ -1,4 +1,4 @@
-"""Tasks by name: what is said of ours, and a task that is registered in a process."""
+"""Tasks by name: our own tasks, and a task registered in this process."""
 
 import subprocess
 import sys
@@ -21,7 +21,7 @@ from surgicai_vision.envs.subtask import NO_PHASE, Demands, Subtask, Tolerance
 
 
 class Hover(Grasp):
-    """A grasp that is done 20 mm off: a task of its own, with no expert."""
+    """A grasp that is done within 20 mm of its goal: a separate task without an expert."""
 
     name = "hover_near"
     text = "Hover near the needle."

@@ -65,7 +65,7 @@ writer.close()
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's MALLOC_PERTURB_")
 def test_what_memory_held_before_does_not_show_in_a_video(tmp_path):
-    """`MALLOC_PERTURB_` fills memory that is handed out: code that reads it unwritten shows it."""
+    """`MALLOC_PERTURB_` fills allocated memory, which exposes code that reads it uninitialised."""
     np.save(tmp_path / "frames.npy", moving(12, 96, 96))
     for fill in ("85", "170"):
         (tmp_path / fill).mkdir()

@@ -1,4 +1,4 @@
-"""A dataset from a dataset, without rendering: fewer views, videos."""
+"""Converting a dataset without rendering: fewer views, videos."""
 
 import json
 import os
@@ -107,7 +107,7 @@ def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
     alone = convert_dataset(
         tmp_path / "set", tmp_path / "alone", video="h264", context=RunContext(0)
     )
-    monkeypatch.setattr(video_jobs, "_dataset", None)  # not in this process
+    monkeypatch.setattr(video_jobs, "_dataset", None)  # this process encodes nothing
     together = convert_dataset(
         tmp_path / "set", tmp_path / "together", video="h264", context=RunContext(2)
     )
@@ -124,7 +124,7 @@ def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
 
 @pytest.mark.parametrize("codec", CODECS)
 def test_an_encoder_leaves_this_thread_its_scheduling(tmp_path, codec):
-    """As root, SVT-AV1 would make it a real-time thread of the highest priority."""
+    """As root, SVT-AV1 would give it real-time scheduling at the highest priority."""
 
     def schedule() -> tuple[int, int]:
         return os.sched_getscheduler(0), os.sched_getparam(0).sched_priority

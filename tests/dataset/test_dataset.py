@@ -278,7 +278,7 @@ def test_statistics_equal_lerobots(fake):
     ours = running.result()
     for name in ("min", "max", "mean", "std"):
         assert np.shape(ours[name]) == (3, 1, 1)
-        # LeRobot's own std is 4e-5 off numpy's here; ours is exact.
+        # LeRobot's std differs from numpy's by 4e-5 here; ours is exact.
         np.testing.assert_allclose(ours[name], theirs[name][0] / 255, atol=1e-4)
         exact = getattr(frames / 255.0, name)(axis=(0, 1, 2))
         np.testing.assert_allclose(np.ravel(ours[name]), exact, atol=1e-12)
@@ -608,7 +608,7 @@ def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(
     assert (spawned.frames, spawned.digest) == (inline.frames, inline.digest)
     assert dataset.fingerprint == open_dataset(tmp_path / "inline").fingerprint
     assert check_dataset(tmp_path / "spawned").problems == ()
-    # Live: the same seed and the recorded actions, looked at on the way.
+    # Live: the same seed and recorded actions, with the observations read on the way.
     demo = read_demo(list_demos(recorded)[1])
     shown = {"obs_type": "pixels_agent_pos", "image_size": 64, "depth": True, "segmentation": True}
     env = envs.make(demo.config, cameras=views, **shown)

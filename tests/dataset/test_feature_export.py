@@ -1,4 +1,4 @@
-"""A dataset with features in place of images is written where the command may write."""
+"""Datasets with features instead of images: accepted folders, and what a kill leaves."""
 
 import numpy as np
 import pytest

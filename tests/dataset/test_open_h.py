@@ -91,7 +91,7 @@ def test_its_actions_held_between_frames_solve_the_task(dataset: Path, demo: Dem
     for action, episode in zip(rows["action"], rows["episode_index"], strict=True):
         if episode == 0 and not ended:
             _, _, ended, _, info = env.step(np.array(action, np.float32))
-    for _ in range(3):  # the arm comes a moment after a set-point that it is led to by jumps
+    for _ in range(3):  # the arm lags behind a set-point that moves in jumps
         if not ended:
             _, _, ended, _, info = env.step(np.array(rows["action"][-1], np.float32))
     assert info["is_success"]

@@ -1,4 +1,4 @@
-"""Variants: one demonstration in several looks; what was recorded stays, splits go by it."""
+"""Variants: one demonstration in several looks; recorded data stay, splits go by demonstration."""
 
 import dataclasses
 
@@ -84,10 +84,10 @@ def test_a_corruption_of_its_own_lies_on_every_variant_and_on_nothing_else(demos
     seen, own = (d.frames("front").astype(int).reshape(6, STEPS, -1) for d in (dataset, clean))
     off = np.abs(seen - own).mean(axis=-1)
     assert (off > 1).all()
-    assert np.unique(off.mean(axis=1)).size == 6  # each variant by strengths of its own
+    assert np.unique(off.mean(axis=1)).size == 6  # each variant has its own strengths
     assert np.ptp(off.mean(axis=1)) > 3
     noise = (seen - own)[:, 0] - (seen - own)[:, 1]
-    assert (np.abs(noise).mean(axis=-1) > 0).all()  # and each frame by a draw of its own
+    assert (np.abs(noise).mean(axis=-1) > 0).all()  # and each frame its own draw
     assert check_dataset(dataset.path).ok
     other = tmp_path / "by other code"
     other.mkdir()
@@ -118,8 +118,8 @@ def test_splits_and_counts_go_by_the_demonstration(dataset):
     assert "Every 3 consecutive episodes show one demonstration" in dataset_card(dataset, "a/b")
 
 
-def test_a_killed_rendering_goes_on_and_a_finished_one_does_nothing(demos, dataset, tmp_path):
-    """The variants of one folder lie in jobs of their own; the digest says that they are equal."""
+def test_a_finished_rendering_does_nothing_and_takes_no_more_variants(demos, dataset, tmp_path):
+    """Each variant is rendered by a separate job; equal digests mean equal datasets."""
     fewer = render(demos, tmp_path / "set", variants=dataclasses.replace(THREE, count=1))
     assert fewer.episodes == 2
     with pytest.raises(OutputExists):

@@ -168,7 +168,7 @@ def test_jitter_and_lost_messages_do_not_show_after_resampling(tmp_path, lost, l
 
 
 def test_a_commanded_jaw_holds_until_the_next_command(tmp_path):
-    """The challenge publishes no measured jaw; its command comes when it changes."""
+    """The challenge publishes no measured jaw, and commands only when they change."""
     motion = shown("grasp")
     found = streams(motion)
     times = found["psm2_pose"][0]

@@ -1,4 +1,4 @@
-"""Bags and options that are wrong: one line names what there is, and nothing of a bag is run."""
+"""Wrong bags and options: one line names what is available, and no code in a bag is run."""
 
 import json
 import sys
@@ -146,7 +146,7 @@ def test_options_of_bags_are_refused_for_pickles(tmp_path, capsys):
 
 
 def test_no_definition_of_a_bag_becomes_code(trial):
-    """`rosbags` would make a module of a bag's definitions; we never ask it to."""
+    """`rosbags` would turn a bag's definitions into a module; we never let it."""
     sys.modules.pop("rosbags.usertypes", None)
     reader.read(trial, BagConfig().all_topics)
     assert "rosbags.usertypes" not in sys.modules

@@ -18,7 +18,7 @@ from surgicai_vision.demos.store import list_demos, read_demo, read_marker, writ
 
 GRASP, PLACE, INSERT = range(3)
 LENGTHS = ((GRASP, 9), (PLACE, 12), (GRASP, 8), (PLACE, 7), (INSERT, 3), (GRASP, 6))
-"""A procedure that goes back to the grasp twice: (phase, control steps) of its visits."""
+"""Visits of a procedure that returns to the grasp twice: (phase, control steps)."""
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def procedures(tmp_path_factory):
 
 @pytest.fixture
 def broken(procedures):
-    """A procedure of the visits in `LENGTHS`, whose jaws hold nothing from step 15 to step 20."""
+    """A procedure with the visits in `LENGTHS`; its jaws hold nothing from step 15 to step 20."""
     demo = read_demo(list_demos(procedures)[0])
     phase = np.concatenate([np.full(length, phase, np.int8) for phase, length in LENGTHS])
     steps = len(phase)

@@ -1,4 +1,4 @@
-"""Demonstrations: store and record, on the stand-in environment (the real one: at the end)."""
+"""Demonstrations: store and record, on the stand-in environment (two noise tests: the real one)."""
 
 import dataclasses
 import json
@@ -95,7 +95,7 @@ def test_each_episode_draws_its_own_noise_within_the_range():
 
 
 def test_the_range_of_noise_reaches_the_recording(tmp_path):
-    """It did not: the jobs were given the largest noise alone."""
+    """Regression: the jobs got only the largest noise."""
     config = TaskConfig("grasp", max_steps=100)
     calm = record(
         config, episodes=2, out=tmp_path / "a", disturbance=Disturbance(0.6, noise_from=0.0)
@@ -107,7 +107,7 @@ def test_the_range_of_noise_reaches_the_recording(tmp_path):
 
 
 def test_open_jaws_have_noise_of_their_own_and_closing_ones_none(tmp_path):
-    """Of closed jaws a random walk would drop the needle."""
+    """A random walk of closed jaws would drop the needle."""
     config = TaskConfig("handoff")
     given = {"seed": 3, "out": tmp_path, "context": RunContext(0)}
     demos = {}
@@ -121,7 +121,7 @@ def test_open_jaws_have_noise_of_their_own_and_closing_ones_none(tmp_path):
     assert closing.any() and not closing.all()
     np.testing.assert_array_equal(executed[closing], labels[closing])
     assert 0.5 < (executed - labels)[~closing].std() <= 1.0, "clipped to the range of an action"
-    # The label takes back what the noise of the step before did: that is what it is for.
+    # The label corrects the noise of the step before: that is its purpose.
     both = ~closing[1:] & ~closing[:-1]
     did, answered = (executed - labels)[:-1][both], labels[1:][both]
     assert np.corrcoef(did, answered)[0, 1] < -0.5
@@ -146,7 +146,7 @@ def test_an_episode_goes_on_after_its_success():
 
 
 class Patient(FakeEnv):
-    """Knows no success while a push lasts."""
+    """An env that reports no success while a push lasts."""
 
     def step(self, action):
         seen, reward, success, truncated, info = super().step(action)

@@ -19,7 +19,7 @@ def text(root):
 
 
 def block(text, language):
-    """Return the one block of code in a language."""
+    """Return the only code block in a language."""
     (found,) = re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     return found
 

@@ -1,4 +1,4 @@
-"""Movement primitives: what they reproduce, where they go instead, and that the env obeys them."""
+"""Movement primitives: reproduction, other starts and goals, and execution in the env."""
 
 import dataclasses
 import math
@@ -38,7 +38,7 @@ AXIS = np.array([1.0, 2.0, 3.0]) / math.sqrt(14.0)
 
 
 def motion(samples=60, dt=0.02, turn=2.5):
-    """50 mm and 2.5 rad on a curve, at rest at both ends; the y axis ends where it began."""
+    """Return a curve of 50 mm and 2.5 rad, at rest at both ends; y ends where it began."""
     s = np.linspace(0.0, 1.0, samples)
     m = 10 * s**3 - 15 * s**4 + 6 * s**5
     bow = np.sin(np.pi * m)
@@ -127,7 +127,7 @@ def test_orientation_takes_the_short_way():
         fit_primitive([demo]), weights=np.zeros((80, 6)), drift=np.zeros(6)
     )
     near = exp_quaternion(np.array([0.0, 0.0, 1.0]))
-    for goal in (near, -near):  # the same rotation, its quaternion from either half
+    for goal in (near, -near):  # the same rotation, with its quaternion of either sign
         played = play(
             straight.start(np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), goal), demo.dt, 80
         )
@@ -186,7 +186,7 @@ turns = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
 @settings(max_examples=15, deadline=None)
 @given(shift=vectors, turn=turns, vector=turns)
 def test_a_moved_demonstration_gives_the_moved_path(shift, turn, vector):
-    """Fitting in another frame and going back is fitting here; log is the inverse of exp."""
+    """Fitting commutes with a change of frame; log is the inverse of exp."""
     np.testing.assert_allclose(log_quaternion(exp_quaternion(vector)), vector, atol=1e-12)
     demo, frame = motion(20), exp_quaternion(turn)
     matrix = np.stack(
@@ -240,7 +240,7 @@ def test_one_demonstration_teaches_other_starts(demonstrated, task):
 
 
 def test_a_half_circle_is_grasped_at_the_same_share_of_its_arc(demonstrated):
-    """The demonstration is of a third of a circle."""
+    """The demonstrated needle is a third of a circle."""
     half_circles = RandomisationConfig(needle_arc="1/2", needle_size=0.2)
     env = envs.make(TaskConfig("handoff", randomisation=half_circles))
     demos = [demonstrated["handoff"]]

@@ -1,4 +1,4 @@
-"""The expert: solves what it should, in actions a policy has, from states it did not come from."""
+"""The expert: it solves every task with a policy's actions, also from states not its own."""
 
 import functools
 
@@ -15,7 +15,7 @@ SEEDS = range(names.VALIDATION_SEED, names.VALIDATION_SEED + 8)
 
 
 def solve(env):
-    """Let the expert go on to the end; return the last info and the actions (steps, 7)."""
+    """Let the expert act to the end; return the last info and the actions (steps, 7)."""
     expert, done = Expert(env), []
     for _ in range(env.config.max_steps):
         done.append(expert.action())
@@ -74,7 +74,7 @@ def test_an_action_depends_on_the_state_alone(task):
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_the_expert_recovers_from_random_actions(task):
-    """Ten random actions in the middle of an episode; the jaw's are small, to drop no needle."""
+    """Ten random actions in the middle of an episode; small for the jaw, to keep the needle."""
     solved = 0
     for seed in SEEDS:
         env = shared(task)

@@ -1,4 +1,4 @@
-"""Datasets of the field, LeRobot v2.1 and v3, become demonstrations that show what they showed."""
+"""LeRobot datasets from elsewhere, v2.1 and v3, become demonstrations of the same motion."""
 
 import dataclasses
 import json
@@ -48,7 +48,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> list[Demo]:
 
 
 def rows_of(demo: Demo, episode: int) -> Rows:
-    """Return what a dataset holds of a demonstration, each frame a state before an action."""
+    """Return the dataset rows of a demonstration; each frame is the state before an action."""
     env = envs.make(demo.config)
     rows: Rows = {names.STATE: [], names.NEEDLE_POSE: []}
     for state in demo.state[:-1]:
@@ -130,7 +130,7 @@ def test_the_same_import_finds_it_finished(demos: list[Demo], tmp_path: Path) ->
 
 
 def test_episodes_that_do_not_show_the_task_are_skipped(demos: list[Demo], tmp_path: Path) -> None:
-    """One of another subtask, and one of a single frame."""
+    """One episode shows another subtask, one has one frame."""
     rows = rows_of(demos[0], 1)
     other = {**rows, "phase": [0] * len(demos[0]), "episode_index": [0] * len(demos[0])}
     short = {key: values[:1] for key, values in rows_of(demos[1], 2).items()}
@@ -147,7 +147,7 @@ def test_episodes_that_do_not_show_the_task_are_skipped(demos: list[Demo], tmp_p
 
 
 def test_elements_are_found_by_name_or_order(demos: list[Demo], tmp_path: Path) -> None:
-    """Of a set with short names, one with an ECM among them, and one without names."""
+    """Datasets have short names, an ECM among the names, or no names."""
     rows = rows_of(demos[0], 0)
     short = [
         name.replace("_pose.position.", "_pos_").replace("_pose.orientation.", "_quat_")
@@ -191,7 +191,7 @@ def test_labels_come_from_phase_text_or_task(demos: list[Demo], tmp_path: Path) 
 
 
 def test_a_frame_of_theirs_is_given_in_the_arm_s_base(demos: list[Demo], tmp_path: Path) -> None:
-    """Poses in the arms' own bases are as good, where the config says so."""
+    """Poses in the arms' own bases give the same result if the config says so."""
     env = envs.make(demos[0].config)
     rows = rows_of(demos[0], 0)
     local = []
@@ -236,12 +236,12 @@ def test_damaged_numbers_are_refused(
 
 
 def other(key: str, value: object) -> Callable[[Rows], Rows]:
-    """Return what puts the same value into every frame of a column."""
+    """Return a function that puts one value into every frame of a column."""
     return lambda rows: {**rows, key: [value] * len(rows["timestamp"])}
 
 
 def first(key: str, value: object) -> Callable[[Rows], Rows]:
-    """Return what puts a value into the first frame of a column."""
+    """Return a function that puts a value into a column's first frame."""
     return lambda rows: {**rows, key: [value, *rows[key][1:]]}
 
 

@@ -1,4 +1,4 @@
-"""The log of a drive: numbers that no drive writes are refused in one line."""
+"""Drive logs: numbers that no drive writes are refused in one line."""
 
 import json
 from collections.abc import Callable

@@ -113,7 +113,7 @@ def test_imported_states_stand_at_the_recorded_poses(tmp_path, recording):
 
 
 def test_actions_move_our_arm_along_the_recorded_path(tmp_path, recording):
-    """The commands our control makes of the converted actions are the recorded poses."""
+    """Our control turns the converted actions back into the recorded poses."""
     from surgicai_vision.envs.control import StepSize, moved
     from surgicai_vision.envs.poses import flat, square
 
@@ -167,7 +167,7 @@ def test_the_step_preset_is_inferred_and_deviations_counted(step):
 
 
 def test_a_step_that_is_no_preset_gets_the_smallest_larger_one():
-    """The first release's insertions: 0.25 mm, 2°."""
+    """As in the first release's insertions: 0.25 mm, 2°."""
     episodes = split(as_arrays(transitions(1, "paper")))
     finer = dataclasses.replace(
         episodes[0], pose=episodes[0].pose * np.array([0.5, 0.5, 0.5, 1, 1, 1, 1])
@@ -197,7 +197,7 @@ def test_the_yaw_goes_the_short_way():
 
 
 def test_actions_that_do_not_fit_the_inferred_step_get_a_larger_one():
-    """Roll, pitch and yaw at once make a rotation vector longer than each."""
+    """Roll, pitch and yaw together make a rotation vector longer than each."""
     episode = split(as_arrays(transitions(1, "paper")))[0]
     assert replay.fitting_step([episode.motion], "paper") == "paper"
     count = len(episode.pose)
@@ -344,7 +344,7 @@ runpy.run_module("surgicai_vision.demos.imports.sandbox", run_name="__main__")
 
 
 def test_the_reading_process_has_one_thread_when_it_leaves_the_network():
-    """The kernel gives a user namespace, which others than root need for it, to no other."""
+    """Without root this needs a user namespace, which only one-thread processes get."""
     child = subprocess.run(
         [sys.executable, "-c", ALONE],
         capture_output=True,
@@ -382,7 +382,7 @@ def test_every_recorded_set_fits_its_task_and_few_others(shared, task):
             check_task(episodes, other)
         except InputError:
             refused += 1
-    # A place recording cannot be told from an insertion: the same arm, the same grasp.
+    # A place recording cannot be distinguished from an insertion: the same arm, the same grasp.
     assert refused == (3 if task == "place" else 4)
     episodes = [replay.trimmed(episode, task) for episode in episodes]
     assert infer_step(episodes) == ("paper" if task == "place" else "shipped", 0)
@@ -395,7 +395,7 @@ def test_needle_poses_agree_with_those_derived_independently(shared, task):
     start = 0
     for episode in split(surgicai_pickle.read(path)):
         poses = replay.needle_path(episode, task)[:-1]
-        # 0.1 mm and 1e-4 of a rotation's elements: the derivation had float32 and rounded hole
+        # 0.1 mm, and 1e-4 in rotation elements: the derivation used float32 and rounded hole
         # poses.
         np.testing.assert_allclose(poses, derived[start : start + len(poses)], atol=1e-4)
         start += len(poses)

@@ -1,8 +1,8 @@
-"""Two hundred malformed and malicious inputs: each is refused in one line, nothing in it runs.
+"""At least two hundred malformed or malicious inputs: each is refused in one line, none is run.
 
-Made here, by format: pickle, npz and bags (recordings), safetensors (demonstrations), parquet
-(datasets), YAML (options). An audit hook sees every process, socket and write that a reader would
-start.
+They are made here, by format: pickle, npz and bags (recordings), safetensors (demonstrations),
+parquet (datasets), YAML (options). An audit hook catches every process, socket and write of a
+reader.
 """
 
 import io
@@ -85,7 +85,7 @@ def watched():
 
 
 def refused(kind, cases, read):
-    """Read every case; each must end in one line and start nothing."""
+    """Read every case; each must give a one-line error and start nothing."""
     for name, case in cases.items():
         with watched():
             try:
@@ -346,7 +346,7 @@ def parquet_bytes(table):
 
 
 def images_of(table, content):
-    """Return the table with another content in its first image."""
+    """Return the table's bytes with other content in its first image."""
     key = names.image_key("front")
     rows = table.column(key).to_pylist()
     rows[0] = {"bytes": content, "path": "/etc/passwd"}
@@ -402,7 +402,7 @@ def data_files(dataset):
         "void": b"",
     }
     cases.update({f"image: {name}": images_of(table, content) for name, content in wrong.items()})
-    # The second half of a column; nobody reads the statistics before it, nor the paths of images.
+    # Spoil the second half of a column; no reader uses the statistics before it, or image paths.
     columns = pq.read_metadata(path).row_group(0)
     for index in range(0, columns.num_columns, 2):
         column = columns.column(index)
@@ -527,7 +527,7 @@ def test_bags(tmp_path):
 
 
 def test_there_are_two_hundred():
-    """Counts what the tests above refused; alone it has nothing to count."""
+    """Counts what the tests above refused; skipped unless they ran."""
     if not all(COUNTS.values()):
         pytest.skip("the others did not run here")
     assert sum(COUNTS.values()) >= 200, COUNTS

@@ -1,4 +1,4 @@
-"""Multiplied demonstrations: what a re-posed piece is, and that the env obeys it elsewhere."""
+"""Multiplied demonstrations: how pieces are re-posed, and that they work from other starts."""
 
 import dataclasses
 
@@ -53,7 +53,7 @@ def sources(tmp_path_factory):
 
 
 def moved(moment, placement):
-    """Return a moment with everything on the phantom moved with it."""
+    """Return a moment with the phantom and everything on it moved."""
     pose = placement.T_world_phantom
     stitch = moment.stitch
     pair = placement.placed_pair(stitch.pair)
@@ -93,7 +93,7 @@ def test_a_moved_phantom_moves_every_piece_rigidly(sources, task):
 
 
 def test_a_longer_needle_keeps_its_shares_of_the_way(sources):
-    """A half circle has further to turn; both end where their own insertion ends."""
+    """A half circle has further to turn; each ends where its own insertion ends."""
     source = cuts.read_source(str(sources["insert"][0]))
     tissue = source.segments["insert"][-1]
     own = source.start.stitch
@@ -244,7 +244,7 @@ def test_recordings_of_surgicai_are_multiplied(shared, tmp_path, task, name):
 
 
 def test_needle_and_grasp_go_with_the_object(sources):
-    """Where the needle lies turned by 20°, the way in to the grasp is turned by as much."""
+    """With the needle turned by 20°, the approach to the grasp turns by the same angle."""
     source = cuts.read_source(str(sources["grasp"][0]))
     (way,) = source.segments["grasp"]
     pose = np.eye(4)

@@ -1,4 +1,4 @@
-"""Recovery: the expert goes back to what was lost; what it records."""
+"""Recovery: the expert returns to the subtask that was undone; what it records."""
 
 import dataclasses
 import itertools
@@ -51,7 +51,7 @@ def test_it_goes_back_to_what_was_lost_and_ends_the_procedure(monkeypatch, plan,
     assert result.success, result.reason
     assert result.upset == plan.kind
     assert visits(result.demo.phase) == expected
-    # The stored states are those that the labels answer, entered subtasks included.
+    # The stored states are those the labels belong to, also where a subtask is entered.
     size = result.demo.state.shape[1]
     env = envs.make(SUTURE)
     env.reset(seed=2)
@@ -79,7 +79,7 @@ def test_undisturbed_it_is_the_expert_but_for_the_goal_of_the_grasp():
         _, _, terminated, truncated, info = env.step(labels[-1])
         ended = terminated or truncated
     assert info["is_success"] and recover.gives_up == ""
-    # The grasp does not know its goal.
+    # The grasp does not use its goal.
     for goal in (5.0, 20.0):
         env.reset(seed=1)
         env.simulation.task_state.grasp_angle = np.radians(goal)
@@ -91,7 +91,7 @@ def test_undisturbed_it_is_the_expert_but_for_the_goal_of_the_grasp():
 
 
 def test_it_gives_up_where_no_way_leads_on(monkeypatch):
-    """A needle that is no longer on the phantom is not sought until the episode's limit."""
+    """It does not look for a needle off the phantom until the episode's limit."""
     env = envs.make(SUTURE)
     env.reset(seed=1)
     recover = RecoveryExpert(env)
@@ -125,7 +125,7 @@ def test_recordings_say_what_went_wrong_and_repeat_themselves(tmp_path):
 
 
 def test_late_it_goes_on_with_nothing_in_its_jaws_and_the_label_says_to_go_back(tmp_path):
-    """Frames between the loss and the way back are labelled with what is due, not what is done."""
+    """Frames between the loss and the return are labelled with what is due, not what is done."""
     late = {}
     for steps in (0, 40):
         wrong = Disturbance(noise=0.2, upset_fraction=1.0, late=steps)
@@ -143,7 +143,7 @@ def test_late_it_goes_on_with_nothing_in_its_jaws_and_the_label_says_to_go_back(
 
 
 def frames_without_needle(demo):
-    """Return what is due in the frames of a broken-off placing or insertion after the loss."""
+    """Return the subtasks due in the frames after the loss in a broken-off place or insert."""
     phase = demo.phase.astype(int)
     episode = np.zeros(len(phase), int)
     due = subtasks_due(phase, np.arange(len(phase)), episode, contact=demo.contact)

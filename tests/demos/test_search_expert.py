@@ -1,4 +1,4 @@
-"""Searching: grasps without the goal; the clock that lets a policy learn them."""
+"""Searching: grasps without reading the goal; the clock that lets a policy learn them."""
 
 import math
 from dataclasses import replace
@@ -72,7 +72,7 @@ def test_its_attempts_on_our_own_needle_are_the_angles_named(pair: HolePair) -> 
 
 
 def test_its_demonstrations_show_every_attempt() -> None:
-    """They go on after the success, so that a learner has seen what follows a failed attempt."""
+    """They go on after the success, so that a learner sees what follows a failed attempt."""
     env = envs.make(TaskConfig("grasp"))
     result = rollout(env, SearchExpert(env), 500_000, "search")
     assert result.success and len(result.demo) == env.config.max_steps and result.demo.success.any()
@@ -95,7 +95,7 @@ def test_the_clock_tells_steps_apart_and_comes_round() -> None:
 
 
 class Stepped(FakeDataset):
-    """A dataset whose action is the clock's."""
+    """A dataset whose action depends on time alone."""
 
     def columns(self) -> dict[str, np.ndarray]:
         columns = super().columns()

@@ -1,4 +1,4 @@
-"""Downloads of weights, against a server on this machine: resumed, verified, given up at once."""
+"""Downloads of weights from a local server: resumed, verified, abandoned at once if offline."""
 
 import hashlib
 import threading
@@ -25,13 +25,13 @@ PINNED = replace(CARD, sha256=SHA256, revision="a" * 40)
 
 @dataclass
 class Hub:
-    """What the server does.
+    """The server's behaviour.
 
     Attributes:
-        cuts: bytes after which one answer after another breaks off; whole ones follow.
-        ranges: whether it knows them.
+        cuts: bytes after which each next answer breaks off; later answers are whole.
+        ranges: whether it supports range requests.
         content: what it sends.
-        asked: the ranges asked for, and the paths.
+        asked: the requested paths and ranges.
     """
 
     cuts: list[int] = field(default_factory=list)
@@ -43,7 +43,7 @@ class Hub:
 
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Hub]:
-    """A hub on this machine, an empty cache, and no weights folder."""
+    """A local hub, an empty cache, and no weights folder."""
     state = Hub()
 
     class Handler(BaseHTTPRequestHandler):

@@ -1,4 +1,4 @@
-"""Encoders: one contract over everything registered, golden values, and what is refused."""
+"""Encoders: one contract for every registered encoder, golden values, and refusals."""
 
 import platform
 import time
@@ -36,7 +36,7 @@ def encoder(request: pytest.FixtureRequest) -> Iterator[Encoder]:
 
 
 def images(count: int = 3, size: int = 224) -> np.ndarray:
-    """Smooth coloured images, each another."""
+    """Smooth coloured images, each different."""
     generator = np.random.default_rng(0)
     coarse = torch.from_numpy(generator.uniform(0, 255, (count, 3, 7, 7)).astype(np.float32))
     fine = torch.nn.functional.interpolate(coarse, (size, size), mode="bilinear")
@@ -64,7 +64,7 @@ def test_same_image_same_feature_in_any_batch(encoder: Encoder) -> None:
 
 
 class Restless(torch.nn.Module):
-    """A network whose answer depends on how many images it is asked for at once."""
+    """A network whose answer depends on the batch size."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -169,8 +169,8 @@ def test_card_is_complete(name: str) -> None:
     assert card.channel_order == "RGB" and card.interpolation in ("bilinear", "bicubic")
     assert all(value > 0 for value in card.std) and card.dim > 0
     assert card.offline == (name in OFFLINE)
-    # The middle of the range must come out near zero: a mean in other units than its range does
-    # not.
+    # The middle of the range must come out near zero, which fails if mean and range
+    # differ in units.
     middle = (sum(card.input_range) / 2 - np.array(card.mean)) / np.array(card.std)
     assert np.abs(middle).max() < 1
 
@@ -232,7 +232,7 @@ class Shrunk(nn.Module):
         self.pool, self.calls = pool, calls
 
     def extra_repr(self) -> str:
-        """Print a function, whose address is another in every process."""
+        """Print a function, whose address differs in every process."""
         return repr(self.calls)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
@@ -241,7 +241,7 @@ class Shrunk(nn.Module):
 
 
 class Doubled(Shrunk):
-    """The same layers, other code."""
+    """The same layers, different code."""
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Return (B, 3) means, doubled."""
@@ -249,7 +249,7 @@ class Doubled(Shrunk):
 
 
 def test_a_network_that_computes_something_else_has_another_fingerprint() -> None:
-    """Without weights of its own nothing else would tell it from the one before."""
+    """Without weights, nothing else would distinguish it from the one before."""
     card = replace(IMAGENET_LITE_EARLY.card, name="own", architecture="mine", dim=3, input_size=32)
     other = (card, Shrunk(nn.MaxPool2d(8))), (card, Doubled(nn.AvgPool2d(8)))
     renamed = replace(card, revision="2"), Shrunk(nn.AvgPool2d(8))
@@ -266,7 +266,7 @@ def test_early_features_are_the_whole_networks_on_the_way() -> None:
     early = Encoder(
         *IMAGENET_LITE_EARLY.build(IMAGENET_LITE_EARLY.card, None),
         pool="spatial",
-        device=torch.device("cpu"),  # a GPU rounds what its convolutions multiply to 10 bits
+        device=torch.device("cpu"),  # a GPU rounds the factors in convolutions to 10 bits
         dtype=torch.float32,
     )
     assert early.shape == (40, 28, 28)

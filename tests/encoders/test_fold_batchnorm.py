@@ -1,4 +1,4 @@
-"""Folding BatchNorms: the answers stay, the passes go, other orders are left alone."""
+"""Folding BatchNorms: outputs stay, BatchNorm passes go, other orders are left alone."""
 
 import copy
 
@@ -17,7 +17,7 @@ def norms(network: nn.Module) -> int:
 
 
 def stirred(network: nn.Module) -> nn.Module:
-    """Give every BatchNorm statistics, scale and shift of its own."""
+    """Give every BatchNorm random statistics, scale and shift."""
     generator = torch.Generator().manual_seed(0)
     for part in network.modules():
         if isinstance(part, nn.BatchNorm2d):
@@ -47,7 +47,7 @@ def test_every_encoder_that_needs_no_download_folds_whole(name: str) -> None:
 
 
 class Backwards(nn.Module):
-    """Its BatchNorm stands behind the convolution and runs before it."""
+    """Its BatchNorm is defined after the convolution and runs before it."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -21,7 +21,7 @@ from surgicai_vision.features.encoders import (
 
 
 def table_of(network: torch.nn.Module, prefix: str = "") -> dict[str, torch.Tensor]:
-    """The network's state, small on disk."""
+    """The network's state in half precision, small on disk."""
     return {
         prefix + name: value.half() if value.is_floating_point() else value
         for name, value in network.state_dict().items()
@@ -34,7 +34,7 @@ def saved(path: Path, content: object) -> Path:
 
 
 def r3m_file(path: Path, depth: int = 18) -> Path:
-    """A file as R3M's: wrapped, with a data-parallel prefix and the heads we leave out."""
+    """A file like R3M's: wrapped, with a data-parallel prefix and the heads we leave out."""
     tensors = table_of(timm.create_model(f"resnet{depth}", num_classes=0), "module.convnet.")
     return saved(
         path,
@@ -117,7 +117,7 @@ def assert_stable(encoder: Encoder, dim: int) -> None:
 def test_known_imagenet_file_classifies(
     shared: Path, name: str, label: int, probability: float
 ) -> None:
-    """Stride and statistics are the file's own: its classifier names the photograph's label."""
+    """Stride and statistics match the file: its classifier names the photograph's label."""
     path = known_file(shared)
     encoder, tensors = load_encoder("imagenet", weights=WeightsSource.of(path)), load_file(path)
     logits = (
@@ -137,7 +137,7 @@ def test_known_imagenet_file_classifies(
 
 
 def test_stride_decides_what_the_known_file_sees(shared: Path) -> None:
-    """With torchvision's stride the same tensors load, and are less sure of the cat."""
+    """With torchvision's stride the same tensors load but are less sure of the cat."""
     card, network = imagenet.classifier(imagenet.CARD, known_file(shared))
     for stage in (network.layer2, network.layer3, network.layer4):
         stage[0].conv1.stride = (1, 1)

@@ -1,4 +1,4 @@
-"""Action mode "absolute": the field's sixteen values drive the env, and say where the arms are."""
+"""Action mode "absolute": the field's sixteen values drive the env and describe the arms."""
 
 import math
 from collections.abc import Callable
@@ -40,7 +40,7 @@ def demonstrated(task: str) -> Demo:
 
 @pytest.mark.parametrize("task", ["grasp", "handoff", "suture"])
 def test_setpoints_of_a_demonstration_replay_it(task: str) -> None:
-    """The expert's set-points, taken as actions, lead where its increments did; PSM2 lets go."""
+    """The expert's set-points as actions replay its increments, PSM2's release included."""
     demo = demonstrated(task)
     env = absolute_env(demo.config)
     actions = []

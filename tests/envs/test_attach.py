@@ -34,7 +34,7 @@ def test_the_needle_stays_without_friction(seed):
     env = made()
     env.reset(seed=seed)
     env.model.geom_friction[:] = 1e-6
-    for _ in range(10):  # the squeeze turns the needle against the weld's give, once
+    for _ in range(10):  # at first the squeeze turns the needle as far as the weld gives
         env.step(np.zeros(7, dtype=np.float32))
     before = in_jaws(env)
     for _ in range(50):

@@ -1,4 +1,4 @@
-"""Contact sheets: what they say can be read."""
+"""Contact sheets: a title fits on its sheet."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Crops: the pixels of the whole image, at a place that reported joints and calibration tell."""
+"""Crops: pixels of the whole image, at the place given by reported joints and calibration."""
 
 import math
 from collections.abc import Iterator
@@ -57,10 +57,10 @@ def side_psm2() -> Iterator[str]:
 
 @pytest.mark.parametrize("view", names.CROPS)
 def test_a_crop_is_cut_from_the_whole_image(plain: SuturingEnv, view: str) -> None:
-    """Equal but for the rounding of a rasteriser, which counts pixels from the window's corner.
+    """Equal up to the rounding of a rasteriser, which counts pixels from the window's corner.
 
-    A silhouette that passes through a pixel's very centre, and a colour at .5 of 255, may fall
-    either way; in the corner where the counts agree every bit is the same.
+    A silhouette that passes exactly through a pixel's centre, and a colour at .5 of 255, may round
+    either way. In the corner where the counts agree, every bit is the same.
     """
     left, top, height, width = window(plain, view)
     crop = {name: plain.image(view, SIZE, name) for name in names.MODALITIES}
@@ -127,7 +127,7 @@ def test_it_follows_what_the_joints_report_not_where_the_jaws_are() -> None:
 
 
 def test_it_does_not_follow_a_camera_that_was_moved(plain: SuturingEnv) -> None:
-    """The window stays, the image is what the moved camera sees there."""
+    """The window stays; the image is what the moved camera sees there."""
     moved = made(camera_shift=5.0, camera_turn=3.0, camera_fovy=3.0)
     moved.set_state(plain.data.qpos, plain.data.qvel)
     for view in names.CROPS:
@@ -184,7 +184,7 @@ def test_a_crop_without_its_place_is_refused(plain: SuturingEnv) -> None:
 
 
 def test_another_distribution_may_offer_a_crop(side_psm2: str) -> None:
-    """It is observed, restored and randomised as ours are."""
+    """It is observed, restored and randomised like ours."""
     axes = RandomisationConfig(camera_shift=3.0, kinematic_error=0.2)
     config = TaskConfig("place", randomisation=axes)
     arguments = {"cameras": (side_psm2, "side"), "image_size": 64, "depth": True}
@@ -215,7 +215,7 @@ def test_every_view_has_images_and_matrices(plain: SuturingEnv, view: str) -> No
         plain.calibration.intrinsics(view, SIZE),
         plain.calibration.extrinsics(view),
     )
-    # Where the image shows the phantom, its depth and the matrices lead to a point of it.
+    # Where the image shows the phantom, depth and matrices give a point on it.
     rows, columns = np.nonzero(parts == names.PARTS.index("phantom"))
     rays = np.linalg.inv(K) @ np.stack([columns, rows, np.ones_like(rows)])
     points = T_world_camera[:3, :3] @ (rays * depth[rows, columns, 0]) + T_world_camera[:3, 3:]

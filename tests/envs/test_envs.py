@@ -1,4 +1,4 @@
-"""The environments' contract: gymnasium's own, determinism, the whole state, refusals."""
+"""The environments' contract: gymnasium's checks, determinism, the complete state, refusals."""
 
 import hashlib
 import subprocess

@@ -1,4 +1,4 @@
-"""The episode monitor: it measures what happened, in known cases, and changes nothing."""
+"""The episode monitor: it measures known cases correctly and changes nothing."""
 
 import math
 
@@ -49,7 +49,7 @@ def test_a_needle_in_the_air_presses_nothing():
 def test_an_instrument_that_is_driven_into_the_tissue_presses_it():
     env, monitor = started()
     down = env.simulation.bases[names.PSM2]
-    # World's -z in the arm's base: the third row of R_world_base, turned round.
+    # World's -z in the arm's base: the third row of R_world_base, negated.
     action = np.array([*(-np.array(down[9:12])), 0, 0, 0, 0], np.float32)
     for _ in range(env.config.max_steps):
         monitor.update(env.step(action)[4])
@@ -79,7 +79,7 @@ def test_the_expert_goes_through_the_middle_of_both_holes():
     assert 0 < monitor.bite.entry_error < 1e-3 and 0 < monitor.bite.exit_error < 1e-3
     assert 0 < monitor.slip < 1e-3 and monitor.turn > 0
     assert not monitor.bite.wrong_hole
-    # The needle begins square to the skin; its circle leaves 21° off the hole's axis
+    # The needle starts square to the skin; its circle leaves at 21° to the hole's axis
     # (`envs.geometry`).
     assert 0 < math.degrees(monitor.bite.entry_angle) < 10
     assert math.degrees(monitor.bite.exit_angle) == pytest.approx(21, abs=4)
@@ -93,7 +93,7 @@ def test_the_expert_goes_through_the_middle_of_both_holes():
 
 
 def lead_tip(monitor, *points):
-    """Move the needle's tip along points in world [m], a millimetre a step."""
+    """Move the needle's tip along world points [m], a millimetre per step."""
     env = monitor._env
     simulation = env.simulation
     pose = np.array(simulation.needle())
@@ -110,7 +110,7 @@ def lead_tip(monitor, *points):
 
 
 def through(hole, inward, off=(0.0, 0.0)):
-    """Return points outside and inside of a hole, `off` its centre [m]."""
+    """Return points outside and inside a hole, offset by `off` from its centre [m]."""
     centre = np.array(hole.centre) + hole.rotation[:, 0] * off[0] + hole.rotation[:, 1] * off[1]
     ends = centre + np.outer((2e-3, -2e-3), hole.rotation[:, 2])
     return ends if inward else ends[::-1]
@@ -203,7 +203,7 @@ def test_the_needle_is_held_by_either_arm():
 def test_depth_counts_only_what_lies_between_entry_and_exit():
     path = [(-1e-3, 0, -5e-3), (2e-3, 1e-3, -1e-3), (5e-3, 0, -2e-3), (9e-3, 0, -5e-3)]
     assert depth_under((0, 0, 0), (8e-3, 0, 0), path) == pytest.approx(2e-3)
-    # Over (5, 0, -2) a line that rises by 2 mm on its 8 is at 0.5625 of its way.
+    # Over (5, 0, -2), a line that rises by 2 mm over 8 mm is at 0.5588 of its length.
     risen = depth_under((0, 0, -1e-3), (8e-3, 0, 1e-3), path[2:3])
     assert risen == pytest.approx(2e-3 - 1e-3 + 2e-3 * (5 * 8 - 1 * 2) / 68, rel=1e-6)
 
@@ -272,7 +272,7 @@ def test_the_expert_stitches_soft_tissue_at_its_marks():
     assert not bite.wrong_hole and monitor.tears == 0.0
     assert bite.length == pytest.approx(env.stitch.pair.gap, abs=1e-3)
     assert 0 < bite.depth < 2e-3
-    # It takes the force of the puncture to get in.
+    # Entering takes the puncture force.
     assert monitor.tissue_force > env.simulation.tissue.forces.puncture_in * 0.8
     assert monitor.tissue_impulse > 0
 

@@ -26,7 +26,7 @@ FURTHEST = RandomisationConfig(phantom_shift=10.0, phantom_turn=15.0, pair="any"
 
 
 def refused(task="insert", scene=SceneConfig(), **axes):
-    """What an env with these axes is refused for, "" for an env that is made."""
+    """Return why an env with these axes is refused, "" if it is made."""
     try:
         envs.make(TaskConfig(task, scene, randomisation=RandomisationConfig(**axes)))
     except InputError as error:
@@ -64,7 +64,7 @@ def test_the_derived_limit_is_that_of_the_room_for_the_jaws(size):
 
 
 def test_the_wide_layouts_narrowest_pair_needs_a_longer_arc():
-    """3dmed is for a needle of 133° (the surgical robotics challenge's)."""
+    """3dmed is made for a needle of 133° (the surgical robotics challenge's)."""
     scene = SceneConfig(layout="3dmed", hole_pair=4)
     assert "Allowed there: grasp, place" in refused(scene=scene)
     assert refused(scene=scene, needle_arc="3/8") == ""
@@ -78,7 +78,7 @@ def test_a_half_circle_comes_round_to_a_steep_flank(layout):
 
 @pytest.mark.parametrize("pair", PAIRS["simple"])
 def test_a_needle_that_comes_out_lies_beyond_the_exits_plane(pair):
-    """The rule is that of the points: with the base in the exit all others are beyond its plane."""
+    """The rule matches the points: with the base in the exit all others are beyond its plane."""
     for radius, tip_angle in ((0.0086, math.pi), (0.0122, math.pi), (0.0102, 2.9), (0.0086, 3.6)):
         stitch = Stitch.of(pair, radius, tip_angle)
         pose = stitch.on_arc(-2 * stitch.half)

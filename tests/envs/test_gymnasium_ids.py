@@ -31,7 +31,7 @@ def run(code, tmp_path):
 def test_stable_baselines_accepts_every_env(task, obs_type):
     chosen = {"cameras": ("front", "back"), "image_size": 36} if "pixels" in obs_type else {}
     env = gymnasium.make(env_id(task), obs_type=obs_type, **chosen)
-    # A gymnasium wrapper hides `compute_reward`, by which a goal env is known.
+    # A gymnasium wrapper hides `compute_reward`, by which a goal env is recognised.
     for checked in (env, env.unwrapped) if obs_type != "goal" else (env.unwrapped,):
         with warnings.catch_warnings():
             warnings.simplefilter("error")

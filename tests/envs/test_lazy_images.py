@@ -29,7 +29,7 @@ def test_what_is_looked_at_late_is_what_is_shown_at_once(config: TaskConfig) -> 
             np.testing.assert_array_equal(lazy[key], plain[key])
         action = rng.uniform(-1, 1, 7).astype(np.float32)
         for env in (shown, later):
-            env.enter(3)  # another arm is active once the observation was made
+            env.enter(3)  # another arm is active after the observation
         seen = [env.step(action)[0] for env in (shown, later)]
 
 

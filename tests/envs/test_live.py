@@ -99,7 +99,7 @@ def test_a_named_camera_is_drawn_as_before(env):
 
 
 def test_who_watches_changes_nothing_of_what_the_env_observes():
-    """Not even where views and observations have one size and the needle changes its shape."""
+    """Not even where views and observations have the same size and the needle changes its shape."""
     config = TaskConfig("handoff", randomisation=RandomisationConfig(needle_size=0.2))
     seen = []
     for watched in (False, True):

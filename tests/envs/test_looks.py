@@ -1,4 +1,4 @@
-"""Looks of episodes: drawn from the seed, part of the state, never held out where one trains."""
+"""Looks of episodes: drawn from the seed, part of the state, never held-out ones in training."""
 
 import hashlib
 import subprocess

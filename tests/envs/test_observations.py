@@ -1,4 +1,4 @@
-"""What the envs show: nothing shared, constant or privileged; starts; rewards of goals."""
+"""What the envs show: nothing shared, constant or privileged; starts; rewards from goals."""
 
 import numpy as np
 import pytest
@@ -84,7 +84,7 @@ def test_vision_holds_images_and_proprioception_only(obs_type, depth, segmentati
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_proprioception_does_not_know_the_needle(task):
-    """Move the needle and every goal, arms fixed: images change, the tool's numbers do not."""
+    """Needle and goals move, arms stay: images change, the tool's values do not."""
     env = make(task, obs_type="pixels_agent_pos")
     seen, _ = env.reset(seed=0)
     qpos = env.data.qpos.copy()
@@ -197,9 +197,9 @@ def test_compute_reward_is_the_reward(task, reward, tolerance):
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_the_goals_pose_alone_is_no_reward(task):
-    """A needle put to its goal is rewarded only where nothing else is asked.
+    """A needle placed at its goal is rewarded only where nothing else is required.
 
-    Jaws are closed on nothing, holes are not passed.
+    Here jaws are closed on nothing and no hole is passed.
     """
     env = make(task, obs_type="goal")
     seen, _ = env.reset(seed=1)
@@ -210,7 +210,7 @@ def test_the_goals_pose_alone_is_no_reward(task):
     assert env.compute_reward(achieved, desired) == (-1.0 if asked else 0.0)
     batch = env.compute_reward(np.stack([achieved, desired]), np.stack([desired, desired]))
     assert batch.tolist() == [-1.0 if asked else 0.0, 0.0]
-    relabelled = seen["achieved_goal"]  # as HER does: what was achieved is what was wanted
+    relabelled = seen["achieved_goal"]  # as HER does: the achieved goal is the desired one
     assert env.compute_reward(seen["achieved_goal"], relabelled) == 0.0
 
 

@@ -281,7 +281,7 @@ def test_an_arm_does_not_know_its_joint_error():
     expected = kinematics.forward(told, "400006")
     np.testing.assert_allclose(env.agent_pos()[:3], expected[:3, 3], atol=1e-6)
     assert np.linalg.norm(env.agent_pos()[:3] - plain.agent_pos()[:3]) > 1e-3
-    # The truth is what success sees: the arm really stands at its start.
+    # Success uses the true pose: the arm really is at its start.
     np.testing.assert_allclose(env.simulation.tip("psm2"), plain.simulation.tip("psm2"), atol=5e-4)
 
 

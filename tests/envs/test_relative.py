@@ -1,4 +1,4 @@
-"""obs_type "relative", and the options that reinforcement learning asks of an env."""
+"""obs_type "relative", and the options that reinforcement learning needs."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_within_the_whole_procedure_it_tells_what_the_present_subtask_asks_for()
 angles = st.floats(-np.pi, np.pi)
 directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 TURN = 0.02
-"""Size of the neighbouring step [rad] in the laws below."""
+"""Angle between neighbouring poses [rad] in the law below."""
 
 
 @settings(max_examples=300, deadline=None)
@@ -124,7 +124,7 @@ def test_the_turn_is_the_rotation_vector_until_it_fades():
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_no_element_jumps_along_episodes(task):
-    """By the expert, and with one angle driven to its end, which passes half a turn of error."""
+    """Driven by the expert, and with one angle turned to its end, past half a turn of error."""
     env = make(task, obs_type="relative")
     largest = np.zeros(SIZE)
     for index in range(4):
@@ -144,7 +144,7 @@ def test_no_element_jumps_along_episodes(task):
     assert largest[:3].max() < 0.2  # [cm]; a step is 0.05
     assert largest[3:9].max() < 0.2
     assert largest[10:13].max() < 0.6
-    assert largest[13:16].max() < 1.0  # 2° a step, five times that where it fades
+    assert largest[13:16].max() < 1.0  # 2° per step, five times that where it fades
     assert np.degrees(env.reset(seed=0)[1]["d_angle"]) < 150
 
 

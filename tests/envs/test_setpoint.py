@@ -1,4 +1,4 @@
-"""The set point beside the measured pose: what an action moves, and where the tool lags behind."""
+"""The set point and the measured pose: an action moves the set point, and the tool lags behind."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is seen of soft tissue: dents, lifts, wounds and marks, as a function of the state alone."""
+"""The visible soft tissue: dents, lifts, wounds and marks, as a function of the state alone."""
 
 import itertools
 import math
@@ -37,7 +37,7 @@ def skin_of(env):
 
 @pytest.fixture(scope="module")
 def insertion():
-    """An env and the states of the expert's insertion, by the tissue's stage when it ended."""
+    """An env and the states of the expert's insertion, each with the tissue's stage."""
     env = make()
     env.reset(seed=names.VALIDATION_SEED)
     expert = Expert(env)
@@ -80,9 +80,9 @@ def test_a_pressing_tip_takes_the_skin_along(insertion):
     depth = math.hypot(*deepest.way)
     assert depth == pytest.approx(-hole.height(tip), abs=3e-4) and depth > 4e-4
     inwards = depth * np.negative(hole.normal)
-    np.testing.assert_allclose(deepest.way, inwards, atol=WAY)  # to what they are rounded
+    np.testing.assert_allclose(deepest.way, inwards, atol=WAY)  # up to their rounding
     points = world_points(env, "skin")
-    # Where the tip is, the drawn skin is no further away than its lines are apart.
+    # The drawn skin is no further from the tip than its mesh lines are apart.
     assert np.linalg.norm(points - tip, axis=1).min() < 6e-4
 
 
@@ -216,7 +216,7 @@ def test_shaping_is_exact_and_can_be_undone():
     whole = {name: world_points(env, name) for name in MATERIALS}
     skin.shape(dented)
     points = world_points(env, "skin")
-    # No point but those about the dent has left the whole skin.
+    # Points at the dent have left the whole skin.
     low = (np.array([hole.height(point) for point in points]) < -5e-4) & (
         np.linalg.norm(points - hole.centre, axis=1) < 2e-3
     )

@@ -1,6 +1,6 @@
 """Success: what must not count does not, and a physics error never does.
 
-Each wrong way is shown beside the right one.
+Each wrong way is tested next to the right one.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_OFFSET
 from surgicai_vision.scene.rotations import rotvec_to_matrix
 
 ASIDE = np.array([0.0, 0.003, 0.0])
-"""Along the wound: beside an opening of ±1.9 mm."""
+"""Shift along the wound, past an opening of ±1.9 mm."""
 
 
 def put(env, pose):
@@ -71,7 +71,7 @@ def inserted_angle(env):
 
 
 def near(env, info):
-    """Is the pose alone within tolerance? Without it a refusal would prove nothing."""
+    """Return whether the pose alone is within tolerance: else a refusal proves nothing."""
     tolerance = env.subtask.tolerances["paper"]
     return info["d_trans"] <= tolerance.distance and info["d_angle"] <= tolerance.angle
 
@@ -129,7 +129,7 @@ def test_tunnelling_beside_the_holes_does_not_count(side):
 
 @pytest.mark.parametrize("depth", [-0.0005, 0.0005])
 def test_dragging_along_the_entrys_plane_does_not_count(depth):
-    """The tip dips below the plane beside the opening and is dragged under it or over it."""
+    """Beside the opening, the tip is moved just above or below the plane and dragged across."""
     env = start("insert")
     outward = env.stitch.pair.entry.rotation[:, 2]
     beside = shifted(env.stitch.place(), ASIDE + 0.002 * outward)
@@ -231,7 +231,7 @@ def test_a_needle_drawn_back_does_not_count():
 
 
 def test_the_closed_form_is_the_naive_test():
-    """The closed form equals the crossing of a fine polyline, anywhere about the holes."""
+    """The closed form equals the crossing of a fine polyline, anywhere near the holes."""
     env = start("pullout")
     simulation, pair = env.simulation, env.stitch.pair
     rng, found = np.random.default_rng(0), np.zeros((3, 2), int)
@@ -261,7 +261,7 @@ GRASPS = {"grasp": (names.PSM2, None), "handoff": (names.PSM1, HANDOFF_ANGLE)}
 
 
 def jaws_at_the_grasp(task, jaw, measured, needle_shift=(0.0, 0.0, 0.0)):
-    """Measure with the jaws at the grasp's pose, the needle `needle_shift` away in its frame."""
+    """Measure with jaws at the grasp's pose, the needle moved by `needle_shift` in its frame."""
     env = start(task)
     simulation, (arm, angle) = env.simulation, GRASPS[task]
     pose = env.stitch.inserted() if task == "handoff" else poses.square(simulation.needle())
@@ -288,7 +288,7 @@ def test_open_jaws_around_the_needle_are_no_grasp(task):
 @pytest.mark.parametrize("task", GRASPS)
 @pytest.mark.parametrize("away", [0.0007, -0.0007, 0.03])
 def test_jaws_closed_on_nothing_are_no_grasp(task, away):
-    """The needle beside the closed jaws, within the distance that counts or far away."""
+    """The needle is beside the closed jaws, within the tolerated distance or far away."""
     angle = {"grasp": 12.5, "handoff": 105.0}[task]
     env, info = jaws_at_the_grasp(task, 0.0, 0.0, away * needle.radial(math.radians(angle)))
     if abs(away) < 0.001:
@@ -301,7 +301,7 @@ def test_jaws_closed_on_nothing_are_no_grasp(task, away):
 
 @pytest.fixture
 def moved_world(monkeypatch):
-    """Shift the holes of layout `simple`; scenes built meanwhile are forgotten afterwards."""
+    """Shift the holes of layout `simple`; scenes built meanwhile are discarded afterwards."""
 
     def move(shift):
         def moved(hole):
@@ -333,7 +333,7 @@ def carry_over(source, target, shift):
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_success_does_not_change_when_the_world_is_moved(task, moved_world):
-    """With everything 3 mm and -6 mm away, every measure of the first and last state is equal."""
+    """With all shifted by 3 mm and -6 mm, every measure of the first and last state is equal."""
     shift = np.array([0.003, -0.006, 0.0])
     here = make(task)
     here.reset(seed=1)
@@ -413,7 +413,7 @@ def test_divergence_is_an_error_and_never_a_success(task, attack, after, monkeyp
 
 
 def test_no_arm_is_pushed_out_of_the_tissue_at_the_start_of_a_pullout():
-    """Starts that put PSM2 into it are drawn again: it would strike when it comes back."""
+    """Starts with PSM2 in the tissue are redrawn: pushed out, it would strike on return."""
     env = envs.make(TaskConfig("pullout"))
     plate = ForcePlate(env.model)
     for seed in (500_013, 500_018):  # the first draws of these are pushed
@@ -460,5 +460,5 @@ def test_a_share_of_the_tolerance_asks_for_so_much_of_it(obs_type):
         assert reward == (0.0 if info["is_success"] else -1.0)
         met += info["paper_success"] and not near
         ended = terminated or truncated
-    assert met  # within the tolerance, and not yet within its half
+    assert met  # within the tolerance, but not yet within half of it
     env.close()

@@ -1,4 +1,4 @@
-"""Soft tissue in motion: it is pierced anywhere, drags, yields, tears, and its state is whole."""
+"""Soft tissue in motion: it is pierced anywhere, drags, yields, tears; its state is complete."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ PHANTOM = FORCES["phantom"]
 
 
 def points(pair, along=0.0, up=0.0):
-    """Return two points (3,) on the flanks, off a pair's marks along the wound and up [m]."""
+    """Return two points (3,) on the flanks, along the wound and up from a pair's marks [m]."""
     shift = along * np.array(pair.entry.axes[1])
     return [
         np.array(hole.centre) + shift - math.copysign(up, hole.tilt) * np.array(hole.axes[0])
@@ -31,7 +31,7 @@ def points(pair, along=0.0, up=0.0):
 
 
 def at_start(simulation, circle):
-    """Put the needle before the tissue; return the angles before and after the whole way."""
+    """Put the needle in front of the tissue; return its angles before and after the whole way."""
     first, last = whole_way(simulation, circle)
     simulation.reset()
     put(simulation, circle.pose(first))
@@ -40,7 +40,7 @@ def at_start(simulation, circle):
 
 
 def driven_to(stage, scene=SOFT, pair=1):
-    """Return a driven simulation at a stage, its circle and the angle [rad] it is at."""
+    """Return a simulation driven to a stage, its circle and its angle [rad]."""
     simulation = driven(scene)
     circle = Circle(*points(PAIRS[scene.layout][pair - 1]), simulation.radius)
     angle, last = at_start(simulation, circle)
@@ -59,7 +59,7 @@ def force(simulation):
 
 
 def settled_force(simulation, steps=25):
-    """Return the force [N] after half a second in which the hand rests."""
+    """Return the force [N] after half a second with the hand at rest."""
     for _ in range(steps):
         simulation.advance(names.PSM1, [0.0] * 7, envs.base.StepSize.of("paper"))
     return force(simulation)
@@ -90,7 +90,7 @@ def assert_passes(simulation, pair, ends, error=2e-4):
     chord = np.linalg.norm(ends[1] - ends[0])
     assert chord < bite.length < 1.3 * chord
     # The skin gives way up to about its puncture force, less where the tip goes through between
-    # two control steps; nothing later needs more than the way out and friction.
+    # two control steps; nothing later takes more than the exit and friction.
     assert 0.7 * PHANTOM.puncture_in < max(before) < 1.4 * PHANTOM.puncture_in
     rub = PHANTOM.puncture_out + PHANTOM.cutting + PHANTOM.friction * bite.length
     assert max(after) < 1.5 * rub
@@ -175,7 +175,7 @@ def test_a_tip_that_is_flat_on_the_skin_does_not_go_through():
     drive(simulation, circle, first, simulation.tip_angle)
     pose = circle.pose(simulation.tip_angle)
     pivot = np.array(pair.entry.centre)
-    # 65° off the inward normal: turned about the wound by what the circle is not.
+    # 65° off the inward normal: the circle's pose turned about the wound.
     turn = math.radians(-90.0)
     about = np.array(
         [
@@ -204,7 +204,7 @@ def drive_still(simulation, steps=1):
 
 
 def test_friction_grows_with_the_embedded_length():
-    """Between the two punctures the force along the shaft is cutting plus friction per length."""
+    """Between the two punctures the shaft's force is cutting force plus friction per length."""
     simulation, circle, angle = driven_to(INSIDE)
     lengths, forces = [], []
 
@@ -219,7 +219,7 @@ def test_friction_grows_with_the_embedded_length():
 
 
 def test_a_needle_that_rests_is_held_by_friction():
-    """Stiction: a hand that lets go leaves the needle where it is."""
+    """Stiction: when the hand lets go, the needle stays where it is."""
     simulation, _, _ = driven_to(THROUGH)
     simulation.data.eq_active[simulation.model.equality("hand").id] = 0
     before = np.array(simulation.needle())
@@ -271,7 +271,7 @@ def test_beyond_the_yield_force_a_part_stays_and_the_needle_is_pulled_back():
     shift = np.array([0.0, 0.003, 0.0])
     largest = pushed(simulation, pose, shift)
     drive_still(simulation, 5)
-    # The needle tilts a little in the hand: what counts is how far its point in the skin is.
+    # The needle tilts a little in the hand: measure how far its point in the skin moved.
     way = simulation.needle_point(angle)[1] - simulation.tissue.bite.entry[1]
     stayed = (way - PHANTOM.yield_force / PHANTOM.lateral_stiffness) / 2
     hardened = PHANTOM.yield_force + PHANTOM.hardening * stayed
@@ -437,7 +437,7 @@ def test_the_thread_follows_through_the_needles_path_and_is_held_there():
 
 
 def test_the_thread_runs_through_two_stitches_in_their_order():
-    """From the needle: the second bite's exit and entry, then the first's, a bite apart."""
+    """From the needle: the second bite's exit and entry, then the first's, each a bite apart."""
     simulation = driven(dataclasses.replace(SOFT, thread=20))
     circles = [Circle(*points(pair), simulation.radius) for pair in PAIRS["simple"][:2]]
     first, last = at_start(simulation, circles[0])
@@ -446,7 +446,7 @@ def test_the_thread_runs_through_two_stitches_in_their_order():
     drive(simulation, circles[1], first, last)
     bites = simulation.tissue.bites
     assert len(bites) == 2 and all(bite.is_done for bite in bites)
-    # Clear of the ridge, so that the thread is drawn taut.
+    # Lift it clear of the ridge, so that the thread is drawn taut.
     for lift in np.arange(0.0, 0.015, 5e-4):
         pose = circles[1].pose(last)
         pose[2, 3] += lift
@@ -476,7 +476,7 @@ def around(simulation, before, after, last, first):
 
 
 def place_on_polyline(point, line):
-    """Return how far along a polyline (N, 3) the place nearest to a point is [m]."""
+    """Return the distance [m] along a polyline (N, 3) to the place nearest to a point."""
     ways = np.diff(line, axis=0)
     lengths = np.linalg.norm(ways, axis=1)
     share = np.clip(((point - line[:-1]) * ways).sum(1) / lengths**2, 0.0, 1.0)
@@ -487,7 +487,7 @@ def place_on_polyline(point, line):
 
 
 def distance_to_polyline(point, line):
-    """Return the distance (m) of a point from a polyline (N, 3)."""
+    """Return the distance [m] of a point from a polyline (N, 3)."""
     ways = np.diff(line, axis=0)
     share = np.clip(((point - line[:-1]) * ways).sum(1) / (ways**2).sum(1), 0.0, 1.0)
     return float(np.linalg.norm(line[:-1] + share[:, None] * ways - point, axis=1).min())

@@ -1,4 +1,4 @@
-"""The whole procedure that goes on only when it is told: `TaskConfig.advance`."""
+"""The whole procedure that advances only when told to: `TaskConfig.advance`."""
 
 import math
 

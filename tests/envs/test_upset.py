@@ -92,7 +92,7 @@ def test_nothing_happens_without_a_plan():
 
 @pytest.fixture(scope="module")
 def moments() -> list[np.ndarray]:
-    """Return states from all over a procedure, those of PSM2's release among them."""
+    """Return states from a whole procedure, including PSM2's release."""
     env = envs.make(TaskConfig(names.SUTURE))
     env.reset(seed=2)
     expert = Expert(env)
@@ -110,7 +110,7 @@ def moments() -> list[np.ndarray]:
 
 
 def test_grasping_can_be_entered_at_any_moment(moments):
-    """PSM2 moves, PSM1 keeps its command, nothing is released any more, progress is kept."""
+    """PSM2 moves, PSM1 keeps its command, no release is pending, progress is kept."""
     env = envs.make(TaskConfig(names.SUTURE))
     assert isinstance(env, Suture)
     env.reset(seed=2)

@@ -1,4 +1,4 @@
-"""Vector envs, sync, async and with our workers, give what single envs give, infos too."""
+"""Vector envs (sync, async, our workers) give what single envs give, infos included."""
 
 import os
 import signal
@@ -107,7 +107,7 @@ def test_importing_registers_every_id():
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
 def test_shares_of_envs_are_one_sync_vector(autoreset):
-    """Three envs on two workers, over ends of episodes, are the same as in this process."""
+    """Three envs on two workers give the same as in this process, across episode ends too."""
     arguments = {
         "max_episode_steps": 3,
         "autoreset_mode": autoreset,
@@ -138,7 +138,7 @@ def test_shares_of_envs_are_one_sync_vector(autoreset):
 
 
 def assert_same(one, other):
-    """Nested tuples, dicts and arrays are equal."""
+    """Assert that nested tuples, dicts and arrays are equal."""
     assert type(one) is type(other)
     if isinstance(one, dict):
         assert one.keys() == other.keys()

@@ -1,4 +1,4 @@
-"""A world that varies: phantom, pair, needle and robot start, together with all that follows."""
+"""A varying world: phantom, pair, needle and robot start, and all that depends on them."""
 
 import dataclasses
 import itertools
@@ -43,7 +43,7 @@ def made(task="grasp", scene=SceneConfig(), **axes):
 
 
 def played(env, steps=200):
-    """What the expert's episode ends with; the env has been reset."""
+    """The last info of the expert's episode; the env has been reset."""
     expert = Expert(env)
     for _ in range(steps):
         _, _, terminated, truncated, info = env.step(expert.action())
@@ -123,7 +123,7 @@ def test_a_state_is_restored_elsewhere_with_its_world(tissue):
 
 
 def test_a_reshaped_needle_is_the_one_that_is_compiled():
-    """Reshaping to the own shape and back changes no number of the model."""
+    """Reshaping to another shape and back changes no number of the model."""
     scene = build_scene(SceneConfig(thread=10))
     model = mujoco.MjModel.__copy__(scene.model)
     reshape_needle(scene.model, model, NeedleShape(0.012, math.pi, 0.0005))
@@ -317,7 +317,7 @@ def test_the_expert_solves_everything_at_once(task):
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("arc", NEEDLE_ARCS)
 def test_the_expert_sews_in_the_corners(arc, sign):
-    """The phantom at its furthest, each arc: insertion and pull-out."""
+    """Insertion and pull-out with the phantom at its furthest, for each arc."""
     corner = {
         "phantom_turn": [sign * math.radians(15.0)],
         "phantom_shift": [sign * 0.010, 0.010],

@@ -1,4 +1,4 @@
-"""CRTK without ROS: states, trajectories, frames, and what an arm makes of its commands."""
+"""CRTK without ROS: states, trajectories, frames, and how an arm handles its commands."""
 
 import dataclasses
 import math
@@ -105,7 +105,7 @@ def test_a_trajectory_keeps_its_speeds_and_ends_at_rest(start, goal):
     assert np.allclose(velocities[[0, -1]], 0.0)
     assert (np.abs(velocities) <= np.array(speeds) * (1 + 1e-9)).all()
     steps = np.diff(positions, axis=0) * np.sign(np.subtract(goal, start))
-    assert (steps >= -1e-12).all()  # nothing turns back
+    assert (steps >= -1e-12).all()  # no joint turns back
     assert way.sample(times[-1] + 100.0).position == tuple(goal)
     assert np.allclose(way.sample(0.0).position, start, atol=1e-8)
 
@@ -139,7 +139,7 @@ def test_the_view_is_what_a_surgeon_sees():
     origin = poses.transform(from_world, ENDOSCOPE)
     assert np.allclose(origin, 0.0)
     needle_home = (0.0, 0.05, 0.075)
-    assert poses.transform(from_world, needle_home)[2] > 0.05  # before the endoscope
+    assert poses.transform(from_world, needle_home)[2] > 0.05  # in front of the endoscope
     higher = poses.transform(from_world, (0.0, 0.05, 0.085))
     assert higher[1] > poses.transform(from_world, needle_home)[1]
     # PSM1 is the surgeon's left arm (`names.TASK_TEXTS`), hence at greater x.
@@ -193,7 +193,7 @@ def test_the_twist_is_the_poses_derivative():
     assert np.allclose([skew[2, 1], skew[0, 2], skew[1, 0]], angular, atol=1e-3)
 
 
-# -- what an arm makes of commands -----------------------------------------------------------------
+# -- how an arm handles commands -------------------------------------------------------------------
 
 
 def test_a_servo_is_superseded_and_moves_keep_their_order():
@@ -217,7 +217,7 @@ def test_moves_overflow_with_an_error_and_nothing_is_lost():
         arm.receive("move_jp", joints(START), "a", NOW)
     with pytest.raises(InputError, match="dropped"):
         arm.receive("move_jp", joints(START), "a", NOW)
-    arm.receive("servo_jp", joints(START), "a", NOW)  # a set point always finds room
+    arm.receive("servo_jp", joints(START), "a", NOW)  # a set point is always accepted
 
 
 def test_joints_may_come_in_any_order_or_without_names():
@@ -310,7 +310,7 @@ def test_a_late_or_old_motion_is_refused(age_s, problem):
 def test_two_clients_at_once_pause_the_arm():
     arm = psm()
     arm.receive("servo_jp", joints(START), "a", NOW)
-    arm.receive("jaw/servo_jp", joints((0.5,), ()), "b", NOW)  # another part of it
+    arm.receive("jaw/servo_jp", joints((0.5,), ()), "b", NOW)  # another part of the arm
     arm.receive("servo_jp", joints(np.add(START, 0.01)), "b", NOW + 10**8)
     assert arm.operating.state == "PAUSED"
     assert [note.level for note in arm.notes] == ["error"]

@@ -1,11 +1,12 @@
 """Semantic conformance: what CRTK's numbers mean, measured through the topics alone.
 
-Each test asks what a probe of the public project DeanDonkov/crtk-conformance asks ("Structural
-Conformance Is Not Semantic Conformance", 2026; its README and src/crtk_conformance/probes/), in
-words and code of our own, of the served simulation in real time on a clock of the test's.
+Each test puts the question of a probe of the public project DeanDonkov/crtk-conformance
+("Structural Conformance Is Not Semantic Conformance", 2026; its README and
+src/crtk_conformance/probes/) to the served simulation, in our own words and code. The simulation
+runs in real time on the test's own clock.
 FrameSemanticsProbe is about frames, ScalingUnitsProbe and GeometryAnchorProbe about units,
 RateSensitivityProbe about states, silence and rates. Where that project needs a tracker as an
-anchor in metres, the simulation's own tip is it.
+anchor in metres, the simulation's own tip serves as one.
 """
 
 import math
@@ -24,9 +25,9 @@ from surgicai_vision.scene.kinematics import INSTRUMENTS
 TOLERANCE_M = 1e-3
 """Task tolerance [m] (crtk-conformance's example)."""
 SPEED = 0.05
-"""Speed of a tip [m/s], likewise; with the tolerance it asks for 50 commands a second."""
+"""Speed of a tip [m/s], same source; with the tolerance it requires 50 commands per second."""
 REACH_M = 0.1
-"""Radius of the workspace [m], over which an error of angle or scale grows, likewise."""
+"""Radius of the workspace [m] over which an error of angle or scale grows, same source."""
 STEP_M = 0.005
 SETTLES_S = 0.6
 
@@ -44,7 +45,7 @@ class Probe:
         self.wait(0.3)
 
     def wait(self, seconds):
-        """Let time pass, and keep what was said: (time, message)."""
+        """Let time pass, and keep what was published as (time, message)."""
         ends = self.served.now + seconds
         while self.served.now < ends - 1e-9:
             self.served.pass_time(min(0.005, ends - self.served.now))
@@ -103,7 +104,7 @@ def shifted(pose, axis, step):
 
 @pytest.mark.parametrize("arm", ["PSM1", "PSM2"])
 def test_unqualified_poses_are_local_ones_in_the_declared_frame(monkeypatch, arm):
-    """Measured_cp · local/measured_cp⁻¹ is one transform wherever the arm is: the base's place."""
+    """Measured_cp · local/measured_cp⁻¹ is one transform wherever the arm is: the base's pose."""
     probe = Probe(monkeypatch, arm)
     declared = poses.compose(poses.invert(T_WORLD_VIEW), probe.served.robot.base(arm))
     for step in (0.0, STEP_M, -STEP_M):
@@ -164,7 +165,7 @@ def test_a_unit_is_a_metre(probe):
 
 
 def test_the_wrists_two_axes_are_as_far_apart_as_the_instruments(probe):
-    """The common normal of the pitch's and the yaw's screw axes is the instrument's own length."""
+    """The common normal of the pitch and yaw screw axes has the instrument's own length."""
     rest = probe.joints()
     axes = []
     for joint in (4, 5):
@@ -201,7 +202,7 @@ def screw_axis(start, end, angle):
 
 
 def test_a_disabled_arm_does_not_move_and_an_enabled_one_does(probe):
-    """The operating state is a precondition, and it is told."""
+    """The operating state is a precondition, and it is reported."""
     probe.command("disable")
     assert probe.newest("operating_state").state == "DISABLED"
     before = probe.pose()
@@ -220,7 +221,7 @@ def test_a_disabled_arm_does_not_move_and_an_enabled_one_does(probe):
 
 @pytest.mark.parametrize("gap", [0.1, 0.5, 2.0])
 def test_an_arm_holds_its_set_point_through_a_silence(probe, gap):
-    """Stop behaviour "hold": no drift while nobody speaks, and the next command is obeyed."""
+    """Stop behaviour "hold": no drift during the silence, and the next command is obeyed."""
     goal = shifted(probe.pose("setpoint_cp"), 0, STEP_M)
     probe.go(goal)
     held = probe.pose()
@@ -245,7 +246,7 @@ def test_states_come_a_hundred_times_a_second(probe):
 
 @pytest.mark.parametrize(("rate", "obeyed"), [(25, 25), (50, 50), (100, 50)])
 def test_each_set_point_of_a_50_hz_client_is_obeyed(probe, rate, obeyed):
-    """Faster ones supersede each other; 50 a second keep the tolerance at the speed (v / ε)."""
+    """Faster ones supersede each other; 50 per second keep the tolerance at `SPEED` (v / ε)."""
     start = probe.pose("setpoint_cp")
     begun = probe.served.now
     for number in range(rate):
@@ -261,7 +262,7 @@ def test_each_set_point_of_a_50_hz_client_is_obeyed(probe, rate, obeyed):
 
 @pytest.mark.parametrize("wait", [0.001, 0.006, 0.011, 0.016])
 def test_a_command_shows_within_two_control_steps(probe, wait):
-    """First motion after a set point: at most 40 ms, whenever in a control step it comes."""
+    """The first motion follows within 40 ms, wherever in a control step the set point arrives."""
     probe.wait(0.5 + wait)
     before = probe.pose()
     begun = probe.served.now

@@ -1,4 +1,4 @@
-"""CRTK over DDS: what is sent arrives, between two processes, and nowhere but on the loopback."""
+"""CRTK over DDS: messages arrive between two processes, by default only over the loopback."""
 
 import contextlib
 import ctypes
@@ -37,7 +37,7 @@ from surgicai_vision.robot.sockets import keep_to, open_sockets
 
 SEED = 900_001
 SIOCGIFADDR = 0x8915
-"""Asks an interface for its address (linux/sockios.h)."""
+"""Request for an interface's address (linux/sockios.h)."""
 PIDFD_GETFD = 438
 """Number of the system call that copies another process's descriptor (linux/unistd.h)."""
 
@@ -78,7 +78,7 @@ def test_a_type_has_the_name_that_ros_gives_it(message):
 
 
 def test_every_socket_hears_the_loopback_alone(transport):
-    """Bound to the device: what comes by another interface is dropped by the kernel."""
+    """Bound to the device: the kernel drops what arrives by another interface."""
     checked = 0
     for descriptor in open_sockets():
         with socket.socket(fileno=os.dup(descriptor)) as one:
@@ -123,7 +123,7 @@ def sockets_of(process):
 
 
 def interfaces():
-    """Return the loopback's name, and that of one interface more that has an address."""
+    """Return the names of the loopback and of one other interface that has an address."""
     found = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         for _, name in socket.if_nameindex():
@@ -186,7 +186,7 @@ def test_a_served_simulation_is_driven_from_another_process(transport):
 
 
 def test_a_policy_drives_the_served_simulation_as_in_process(tmp_path):
-    """`serve` and `drive`, a process each: the same poses at every step as in this process."""
+    """`serve` and `drive`, in one process each: the same poses at every step as in this process."""
     own = envs.make(TaskConfig("grasp", max_steps=25))
     own.reset(seed=SEED)
     agent = RandomAgent()

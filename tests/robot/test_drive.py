@@ -1,4 +1,4 @@
-"""A policy at a served simulation, over a transport within this process, and its guards."""
+"""A policy driving a served simulation over an in-process transport, and its guards."""
 
 import dataclasses
 import io
@@ -84,7 +84,7 @@ def drive(
     through=None,
     frames=None,
 ):
-    """Drive one episode; returns it, the lines of its log, what was told, and the transport."""
+    """Drive one episode; return it, the lines of its log, the notices and the transport."""
     served = transport or Served(task, views)
     client = Client(through or served, ClientConfig(views=views, is_simulated=config.is_simulated))
     client.connect()
@@ -97,7 +97,7 @@ def drive(
 
 
 def by_expert(task):
-    """Return the env, and phase and action of every step of the expert's success from `SEED`."""
+    """Return the env, and the (phase, action) pairs of the expert's success from `SEED`."""
     env = env_of(task)
     env.reset(seed=SEED)
     expert = Expert(env)
@@ -120,7 +120,7 @@ def test_a_driven_policy_moves_as_in_process():
 
 
 def random_positions(steps):
-    """Return the joints after a random policy's steps in this process."""
+    """Return the joint positions after a random policy's steps in this process."""
     own = envs.make(TaskConfig("grasp"))
     own.reset(seed=SEED)
     agent = RandomAgent()
@@ -131,7 +131,7 @@ def random_positions(steps):
 
 
 class OtherFrames:
-    """A robot whose local frames and tip are others: a transport that turns its poses."""
+    """A robot with other local frames and another tip: a transport that transforms its poses."""
 
     def __init__(self, inner, bases, tip):
         self.inner = inner
@@ -234,7 +234,7 @@ def test_an_agent_reads_the_same_poses_as_in_process():
 
 
 def test_a_whole_procedure_succeeds_as_in_process():
-    """Both arms, all five subtasks and PSM2's letting go, through topics alone."""
+    """Both arms, all five subtasks and PSM2 letting go, through topics alone."""
     env, rows = by_expert("suture")
     final = env.data.qpos.copy()
     episode, lines, _, served = drive(Script(rows), "suture", len(rows) + 100)
@@ -247,7 +247,7 @@ def test_a_whole_procedure_succeeds_as_in_process():
 
 
 def test_what_a_client_does_is_recorded_as_it_was_told(tmp_path):
-    """Actions of the record are those that the client added; states are the simulation's."""
+    """The recorded actions are the client's increments; the states are the simulation's."""
     env, rows = by_expert("grasp")
     told = []
     with open_recordings(tmp_path / "demos", env.config, env.scene.hash) as recordings:
@@ -264,7 +264,7 @@ def test_what_a_client_does_is_recorded_as_it_was_told(tmp_path):
 
 
 def test_the_log_of_a_drive_becomes_demonstrations(tmp_path):
-    """Every subtask that was driven, with the arms where they were measured."""
+    """One demonstration per driven subtask, with the arms where they were measured."""
     env, rows = by_expert("suture")
     _, lines, _, _ = drive(Script(rows), "suture", len(rows) + 100)
     about = json.dumps({"policy": "script"})

@@ -1,4 +1,4 @@
-"""Released policies at a served simulation: the same ends, episode by episode, as in process."""
+"""Released policies driving a served simulation: each episode ends as it does in process."""
 
 import io
 
@@ -16,7 +16,7 @@ from surgicai_vision.robot.transport import Transport, open_transport
 
 
 def check_same_ends(spec: PolicySpec, transport: Transport, seeds: tuple[int, ...]) -> None:
-    """Drive what a transport leads to, and compare with the same policy and starts in process."""
+    """Drive over a transport, and compare with the same policy and starts in process."""
     agent = spec.make_agent()
     task = spec.config
     own = evaluate(lambda: agent, task, seeds, batch=1, workers=1)
@@ -34,7 +34,7 @@ def check_same_ends(spec: PolicySpec, transport: Transport, seeds: tuple[int, ..
 
 
 def test_a_released_policy_ends_as_it_does_in_process():
-    """From images, measured poses and within guards; the steps are the same too."""
+    """From images and measured poses, within the guards; the step counts are the same too."""
     spec = open_policy("released:grasp")
     agent = spec.make_agent()
     served = Served("grasp", tuple(agent.cameras), size=agent.image_size)
@@ -42,10 +42,10 @@ def test_a_released_policy_ends_as_it_does_in_process():
 
 
 def test_the_whole_procedure_ends_as_it_does_in_process():
-    """By released policies, served in a process of its own, over cyclonedds.
+    """With released policies, over cyclonedds, served in a separate process.
 
-    Five low-level policies, the high-level one that says when each ends, and PSM2's letting go.
-    `benchmarks/robot.py` counts more episodes, and in real time.
+    Five low-level policies, the high-level one that says when each ends, and PSM2 letting go.
+    `benchmarks/robot.py` evaluates more episodes, and in real time.
     """
     pytest.importorskip("cyclonedds", reason="the extra `ros` is not installed")
     spec = open_policy("released:suture")

@@ -1,7 +1,7 @@
-"""Faults: whatever goes wrong, the arm is still within 100 ms and the log says why.
+"""Faults: whatever goes wrong, the arm stands still within 100 ms and the log says why.
 
-On the robot's side: what a client does wrong, or no more. On the client's: what a robot says wrong,
-or no more.
+On the robot's side: what a client does wrong or no longer does. On the client's side: what a robot
+reports wrongly or no longer reports.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from surgicai_vision.robot.simulated import SimulatedRobot
 STILL_STEPS = 5
 """Control steps of 100 ms."""
 STILL_M = 2e-4
-"""Way of a still tip within ten control steps [m]; one at a millimetre a step goes 10 mm."""
+"""Most that a still tip moves in ten control steps [m]; at a millimetre per step it moves 10 mm."""
 SECOND = 1_000_000_000
 START = 1_800_000_000 * SECOND
 HEARD = topics.psm_topics("PSM2", heard=True)
@@ -39,7 +39,7 @@ SAID = topics.psm_topics("PSM2", heard=False)
 
 
 class RealServer:
-    """A server in real time whose control steps are taken when the test asks, one after another."""
+    """A real-time server whose control steps are taken one at a time, when the test asks."""
 
     def __init__(self, monkeypatch):
         self.medium = Medium()
@@ -88,7 +88,7 @@ def late(served):
 
 
 def out_of_order(served):
-    served.send(stamp=START + SECOND // 10)  # in the middle of what was obeyed
+    served.send(stamp=START + SECOND // 10)  # between stamps already obeyed
 
 
 def not_finite(served):
@@ -185,7 +185,7 @@ class Along(Agent):
 
 
 class Faulty(Served):
-    """A robot whose messages, once a fault begins, are others or none."""
+    """A robot whose messages are altered or dropped once a fault begins."""
 
     def __init__(self):
         super().__init__("grasp")
@@ -261,7 +261,7 @@ def robot_jumps(topic, message):
     ids=lambda value: getattr(value, "__name__", value),
 )
 def test_nothing_is_sent_within_100_ms_of_a_robots_fault(monkeypatch, fault, reason):
-    """In real time, on a clock of the test's: each step of the driver takes 20 ms."""
+    """In real time on the test's own clock: each step of the driver takes 20 ms."""
     served = Faulty()
     clock = [100.0]
 
@@ -306,7 +306,7 @@ def test_nothing_is_sent_within_100_ms_of_a_robots_fault(monkeypatch, fault, rea
 
 
 class Interrupted(Along):
-    """Moves along, and has something happen in one of its steps."""
+    """Moves along, and makes something happen in one of its steps."""
 
     def __init__(self, act):
         self.does = act
@@ -343,9 +343,9 @@ def another_client(served):
     ids=["pause", "disable", "fault", "two clients"],
 )
 def test_a_driven_arm_that_is_stopped_is_still_and_told_nothing(monkeypatch, act, reason, ends):
-    """In real time, both sides: still within 100 ms, the log says why, and has all that was sent.
+    """In real time on both sides: still within 100 ms; the log says why and has all that was sent.
 
-    After `resume` the episode goes on.
+    After `resume` another episode is driven with nothing held back.
     """
     served = VirtualTime(monkeypatch, "grasp", 0.007)
     sent = MemoryTransport(served.medium).inbox(HEARD["servo_cp"])

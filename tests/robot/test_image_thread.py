@@ -1,4 +1,4 @@
-"""Images in real time: rendered ahead, published when their state is the present one."""
+"""Images in real time: rendered ahead, published once their state is the current one."""
 
 import time
 
@@ -80,10 +80,10 @@ def test_what_a_reset_replaced_is_never_shown(running, states):
 
 @pytest.mark.parametrize("phase_ms", range(20))
 def test_control_steps_are_drawn_to_come_just_after_images(phase_ms):
-    """From every phase, within six steps, by 2 ms a step at most."""
+    """From every phase within six steps, by at most 2 ms per step."""
     due = 1e-3 * phase_ms
     for _ in range(6):
-        step = CONTROL_S + drawn_to_images(due)  # an image came at 0, and every control step since
+        step = CONTROL_S + drawn_to_images(due)  # images arrive from 0 on, one per control step
         assert abs(step - CONTROL_S) <= 2e-3 + 1e-12
         due += step
     assert (due - AFTER_IMAGE_S + 1e-3) % CONTROL_S == pytest.approx(1e-3, abs=1e-6)

@@ -1,4 +1,4 @@
-"""Real time, on a clock of the test's: no action of a policy is lost to the way there and back."""
+"""Real time on the test's own clock: no action of a policy is lost on the round trip."""
 
 import io
 import json
@@ -21,7 +21,7 @@ ALONG = (0.5, 0.0, 0.3, 0.0, 0.0, 0.2, -0.5)
 
 
 class Slow(Agent):
-    """Moves steadily, and takes its time to say so [s]."""
+    """Moves steadily, and takes `latency` [s] over each action."""
 
     name = "slow"
     cameras = ()
@@ -40,7 +40,7 @@ class Slow(Agent):
 
 
 def driven(monkeypatch, phase, latency):
-    """Drive for some steps; returns the served simulation and the lines of the log."""
+    """Drive for `STEPS` steps; return the served simulation and the lines of the log."""
     served = VirtualTime(monkeypatch, "grasp", phase)
     client = Client(served, ClientConfig(is_simulated=True))
     client.connect()
@@ -71,6 +71,6 @@ def test_every_action_counts_whenever_it_comes(monkeypatch, phase, latency):
     assert all(line["sent"] for line in lines)
     there = served.robot.env.agent_pos() - start
     assert np.linalg.norm(moved[:3]) > 8e-3
-    # Of forty steps at most one does not arrive: the one that the last of them superseded.
+    # At most one of the forty actions is lost: the one that the last of them superseded.
     assert np.linalg.norm((there - moved)[:3]) < 1.1 * np.linalg.norm(moved[:3]) / STEPS
     assert abs((there - moved)[6]) < 1.1 * abs(moved[6]) / STEPS + 1e-3

@@ -1,4 +1,4 @@
-"""The served simulation, over a transport within this process."""
+"""The served simulation, over an in-process transport."""
 
 import dataclasses
 import functools
@@ -31,7 +31,7 @@ def env_of(task):
 
 
 class Client:
-    """Publishes commands to a server of the same process and reads what it says."""
+    """Publishes commands to a server in the same process and reads what it publishes."""
 
     def __init__(self, task="grasp", source="client", **config):
         self.env = env_of(task)
@@ -63,7 +63,7 @@ class Client:
         self.take()
 
     def take(self):
-        """Return topic → the messages since the last time."""
+        """Return topic → the messages since the last call."""
         taken = {name: [r.message for r in inbox()] for name, inbox in self.inboxes.items()}
         return {name: messages for name, messages in taken.items() if messages}
 
@@ -71,7 +71,7 @@ class Client:
         self.transport.publisher(self.topics[topic])(message)
 
     def step(self, **commands):
-        """Send commands, ask for a step and return what the server then says."""
+        """Send commands, request a step and return what the server then publishes."""
         self.stamp += 1
         for topic, message in commands.items():
             self.say(topic, message)
@@ -114,7 +114,7 @@ def test_what_is_measured_is_what_the_simulation_reports(client):
 
 
 def test_served_actions_move_as_the_envs_own_do():
-    """Increments on the published set point, sent as servo_cp: the same motion in the same env."""
+    """Increments on the published set point, sent as servo_cp, move as the env itself does."""
     config = TaskConfig("grasp")
     own = envs.make(config)
     own.reset(seed=SEED)
@@ -223,7 +223,7 @@ def test_a_reset_begins_the_episode_of_its_seed_again():
 
 
 def test_what_was_sent_before_a_reset_is_not_obeyed_after_it():
-    """A client sends until its episode ends; its last command may lie there beside the reset."""
+    """A client sends until its episode ends; its last command may be queued with the reset."""
     client = Client()
     client.step()
     before = client.env.get_state()
@@ -237,7 +237,7 @@ def test_what_was_sent_before_a_reset_is_not_obeyed_after_it():
 
 
 def test_a_request_that_comes_twice_is_met_once(client):
-    """A client asks anew where no answer came; without a stamp every request is a new one."""
+    """A client repeats a request that got no answer; without a stamp every request is new."""
     before = client.robot.steps
     for _ in range(3):
         client.say(topics.STEP.name, StringStamped(Header(client.stamp + 5), ""))
@@ -309,7 +309,7 @@ def test_in_real_time_two_states_are_published_a_control_step():
 
 
 def test_half_a_control_step_changes_nothing_of_the_whole():
-    """The physics are the same, bit for bit, with or without a look at them halfway."""
+    """The physics is the same, bit for bit, with or without a reading halfway."""
     plain, watched = (envs.make(TaskConfig("grasp")) for _ in range(2))
     seen = []
     for env in (plain, watched):

@@ -77,7 +77,7 @@ def test_senders_are_told_apart_by_their_numbers(numbers, sources):
 
 
 def random_poses():
-    """Return what both arms measure at every step of a random policy in this process."""
+    """Return both arms' measured poses at every step of a random policy in this process."""
     env = envs.make(TaskConfig("grasp", max_steps=STEPS))
     env.reset(seed=SEED)
     agent = RandomAgent()
@@ -91,7 +91,7 @@ def random_poses():
 
 
 def check_serve_and_drive(name, options, tmp_path):
-    """Serve and drive over a transport, a process each; every pose is as in this process."""
+    """Serve and drive over a transport, in one process each; every pose is as in this process."""
     serve = ("robot", "serve", "--task", "grasp", "--clock", "stepped", "--transport", name)
     drive = (
         *("robot", "drive", "random", "--task", "grasp", "--simulated", "--clock", "stepped"),

@@ -45,7 +45,7 @@ def seen(source, model, look: Appearance, camera: str = "front") -> np.ndarray:
 
 
 def parts(value: object) -> Iterator[object]:
-    """Yield a family's patterns, finishes and lamps, and of the last two the colours."""
+    """Yield a family's patterns, finishes and lamps, and the colours of the last two."""
     for field in dataclasses.fields(value):
         part = getattr(value, field.name)
         if isinstance(part, Finish | Lamps):
@@ -57,7 +57,7 @@ def parts(value: object) -> Iterator[object]:
 
 
 WHITE = (255.0, 255.0, 255.0)
-"""A tint that leaves a texture as it is; no colour of its own."""
+"""A tint that leaves a texture unchanged, hence no colour in its own right."""
 
 
 def test_families_are_those_of_the_names_five_to_train_three_held_out():
@@ -76,7 +76,7 @@ def test_held_out_families_share_no_part_with_those_for_training():
 
 
 def test_families_for_training_draw_nothing_of_the_held_out(monkeypatch, source, model):
-    """With every held-out part broken, all of training can still be drawn, and rendered."""
+    """With every held-out part broken, each training family can still be drawn and rendered."""
 
     def broken(*_: object) -> None:
         raise AssertionError("a held-out part was drawn")
@@ -145,7 +145,7 @@ def test_textures_tile():
 
 
 def test_going_back_to_an_appearance_shows_the_same_pixels(source, model):
-    """Whatever another renderer of the model has shown in between, plain included."""
+    """Whatever looks the model has had in between, the plain one included."""
     appearance.apply(source, model, Appearance("muscle", 1))
     with FrameRenderer(model, *SIZE) as renderer, FrameRenderer(source, *SIZE) as compiled:
         first = renderer.render(at_rest(model), "front")
@@ -191,7 +191,7 @@ def test_an_unknown_family_is_refused():
 
 @pytest.mark.parametrize("family", names.APPEARANCES)
 def test_needle_and_marks_can_be_made_out(source, model, family):
-    """Seen from the front, the needle's mean colour is not that of the tissue beside it."""
+    """Seen from the front, the needle's mean colour differs from that of the tissue around it."""
     for seed in range(3):
         appearance.apply(source, model, Appearance(family, seed))
         data = at_rest(model)

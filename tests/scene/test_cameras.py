@@ -1,4 +1,4 @@
-"""Cameras: the published poses arrived, and the wrist cameras see what they aim at."""
+"""Cameras: they have the published poses, and the wrist cameras see what they aim at."""
 
 import math
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ SIZE = (224, 224)
 
 
 def at_start(instrument: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The scene with both tools at their starts, the jaws open."""
+    """Return the scene with both tools at their starts and the jaws open."""
     model = build_scene(SceneConfig(instrument=instrument)).model
     data = mujoco.MjData(model)
     for arm in ARMS:
@@ -42,7 +42,7 @@ def at_start(instrument: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 
 def stand(name: str) -> CameraPose:
-    """A fixed camera's pose in world."""
+    """Return a fixed camera's pose in world."""
     pose = cameras.CAMERAS.load(name)
     assert isinstance(pose, CameraPose)
     return pose
@@ -132,7 +132,7 @@ def test_wrong_names_are_refused(start):
 
 @pytest.fixture
 def side() -> Iterator[str]:
-    """A camera of another distribution, at the scene's side."""
+    """A camera of another distribution, to the side of the scene."""
     pose = CameraPose((0.12, 0.03, 0.10), (-0.9, 0.0, -0.5), (0.0, 0.0, 1.0), 0.7)
     cameras.register_camera("side", pose)
     yield "side"

@@ -1,4 +1,4 @@
-"""Distractors: seen beside the way of the needle, and nothing else."""
+"""Distractors: seen clear of the needle's path, and without any other effect."""
 
 import copy
 import itertools
@@ -66,7 +66,7 @@ def test_fewer_are_the_first_of_more():
 
 
 def test_they_are_seen_as_background(source):
-    """No pixel becomes another part's, but those that a thing hides become background."""
+    """No pixel becomes another part; those that a distractor hides become background."""
     model = copy.copy(source)
     plain, parts = views(model), views(model, "segmentation")
     distractors.scatter(source, model, Litter(MOST, 3))

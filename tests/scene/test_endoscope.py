@@ -1,4 +1,4 @@
-"""The endoscope: a da Vinci's two eyes, clear of both arms, one rig, at a working distance."""
+"""The endoscope: a da Vinci's two eyes as one rig, at a working distance, clear of both arms."""
 
 import math
 
@@ -24,7 +24,7 @@ from surgicai_vision.scene.cameras import (
 from surgicai_vision.scene.compose import build_spec
 
 CLEARANCE = 0.030
-"""Least distance between the shaft's skin and an arm [m]."""
+"""Least distance between the shaft's surface and an arm [m]."""
 
 
 @pytest.fixture(scope="module")

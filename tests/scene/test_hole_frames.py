@@ -1,4 +1,4 @@
-"""The frames of holes: what `height` and `local` say is what the rotation says."""
+"""The frames of holes: `height` and `local` agree with the rotation."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Look: images show what physics has, and nothing that is only seen changes physics."""
+"""Looks: images show what the physics has, and what is only seen does not change it."""
 
 import cv2
 import mujoco
@@ -17,7 +17,7 @@ SIZE = (480, 480)
 
 
 def at_start(model: mujoco.MjModel, opening: float = 0.4) -> mujoco.MjData:
-    """Both tools at their starts, the jaws open by `opening` [rad]."""
+    """Return both tools at their starts, with the jaws open by `opening` [rad]."""
     data = mujoco.MjData(model)
     for arm in ARMS:
         for name, value in zip(
@@ -61,7 +61,7 @@ def test_physics_is_the_same_without_the_looks(model, monkeypatch):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_skin_lies_on_the_flanks_and_the_holes_are_open(layout):
-    """The depth at each hole's rim is that of the flank, and in its middle it is deeper."""
+    """The depth at each hole's rim is that of the flank; at its centre it is greater."""
     model = build_scene(SceneConfig(layout=layout)).model
     data = at_start(model)
     T_world_camera, matrix = extrinsics(model, data, "back"), intrinsics(model, "back", *SIZE)
@@ -69,7 +69,7 @@ def test_the_skin_lies_on_the_flanks_and_the_holes_are_open(layout):
         depth = renderer.render(data, "back", "depth")[..., 0]
 
     def beyond(point):
-        """How much further than `point` the camera sees along its ray [m]."""
+        """Return how much further than `point` the camera sees along its ray [m]."""
         in_camera = (np.linalg.inv(T_world_camera) @ [*point, 1.0])[:3]
         u, v = np.rint((matrix @ in_camera / in_camera[2])[:2]).astype(int)
         return depth[v, u] - in_camera[2]
@@ -103,7 +103,7 @@ def test_images_are_bright_and_coloured_everywhere(model, camera):
     assert image[parts == 0].max(axis=1).min() > 30  # no black background
     needle_colour = image[parts == PARTS.index("needle")].mean()
     tissue_colour = image[parts == PARTS.index("phantom")].mean()
-    assert needle_colour > tissue_colour + 40  # of steel that is lit and does not glow
+    assert needle_colour > tissue_colour + 40  # lit steel that does not glow
     assert (image == 255).all(axis=2).mean() < 0.01
 
 

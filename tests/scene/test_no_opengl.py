@@ -1,4 +1,4 @@
-"""A machine without OpenGL: said in one line, before any work."""
+"""A machine without OpenGL: reported in one line, before any work."""
 
 import ctypes.util
 import os
@@ -15,7 +15,7 @@ WITHOUT = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
 def run(
     verb: str, *options: str, where: Path, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    # This process may have drawn with EGL, and PyOpenGL has written so into its environment.
+    # If this process has drawn with EGL, PyOpenGL has recorded that in its environment.
     ours = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
     return subprocess.run(
         [sys.executable, "-m", "surgicai_vision", verb, *options],

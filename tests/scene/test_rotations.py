@@ -71,7 +71,7 @@ def test_roll_pitch_yaw_round_trips(roll, pitch, yaw):
     assert -2 * math.pi < found[0] <= 0
     assert same(
         rotations.rpy_to_matrix(*found), matrix, 3e-9
-    )  # 1e-9: where the pitch counts as gimbal lock
+    )  # within 1e-9 the pitch counts as gimbal lock
 
 
 def test_roll_keeps_the_released_range():

@@ -1,4 +1,4 @@
-"""The compiled scene: declared numbers arrived, and the laws of mechanics hold in it."""
+"""The compiled scene: it has the declared numbers, and the laws of mechanics hold in it."""
 
 import dataclasses
 import math
@@ -62,7 +62,7 @@ def test_the_model_has_the_declared_limits(instrument):
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize("side", [0, 1])
 def test_joint_limits_hold_under_pushing(joint, side):
-    """A servo told to go half a radian (5 cm) past a limit ends at it."""
+    """A servo commanded half a radian (5 cm) past a limit ends at it."""
     scene = build_scene(SceneConfig())
     model, data, ids = scene.model, mujoco.MjData(scene.model), scene.arms["psm1"]
     limits, outwards = kinematics.limits(), 2 * side - 1
@@ -76,9 +76,9 @@ def test_joint_limits_hold_under_pushing(joint, side):
     for _ in range(250):
         mujoco.mj_step(model, data)
         beyond.append(outwards * (data.qpos[ids.qpos.start + joint] - limits[joint, side]))
-    assert beyond[-1] > -1e-3  # it did get there
+    assert beyond[-1] > -1e-3  # it did reach the limit
     assert beyond[-1] < 5e-4
-    assert max(beyond) < (0.005 if joint == 2 else 0.012)  # [m or rad], while it strikes
+    assert max(beyond) < (0.005 if joint == 2 else 0.012)  # [m or rad], on impact
     assert not warnings_of(data)
 
 
@@ -168,7 +168,7 @@ def test_the_needle_falls_at_g(simulation):
     mujoco.mj_step(model, data, steps)
     time = steps * model.opt.timestep
     fallen = 3.0 - data.qpos[start + 2]
-    # The explicit integrator takes n (n + 1) / 2 parts where the continuum takes n² / 2.
+    # The explicit integrator sums to n (n + 1) / 2 where the continuum gives n² / 2.
     assert math.isclose(fallen, GRAVITY * time**2 / 2 * (1 + 1 / steps), rel_tol=0.005)
     assert math.isclose(-data.qvel[dof + 2], GRAVITY * time, rel_tol=0.005)
     assert np.allclose(data.qpos[start : start + 2], 0.3, atol=1e-4)
@@ -210,7 +210,7 @@ def test_the_holes_of_the_simple_layout_are_surgicais(number):
 )
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_the_circle_through_both_holes_clears_the_phantom(layout, clearance, number):
-    """From the tip in the entry until the base is out; `clearance` [mm] is that of the skin."""
+    """From the tip in the entry until the base is out; `clearance` [mm] is between surfaces."""
     scene = build_scene(SceneConfig(layout=layout, hole_pair=number))
     simulation, stitch = Simulation(scene), Stitch.of(scene.pair)
     model, data = simulation.model, simulation.data

@@ -1,4 +1,4 @@
-"""Soft tissue's elements and forces: springs are as stiff as asked for, what yields stays."""
+"""Soft tissue's elements and forces: springs are as stiff as requested, yielding is permanent."""
 
 import dataclasses
 
@@ -72,7 +72,7 @@ def test_only_the_needle_meets_the_skin():
 
 
 def weight_on_a_spring(stiffness, mass):
-    """Return how far a weight of `mass` [kg] pulls a hold of `stiffness` [N/m] at rest."""
+    """Return how far [m] a weight of `mass` [kg] at rest stretches a hold of `stiffness` [N/m]."""
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.002
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -143,7 +143,7 @@ def test_below_the_yield_force_nothing_stays():
 
 
 def test_pulled_slowly_it_hardens_until_it_tears():
-    """The force over the way: elastic, then half as stiff (hardening as stiff as it is), a tear."""
+    """Force over displacement: elastic, then half as stiff (hardening equals stiffness), a tear."""
     assert PHANTOM.hardening == PHANTOM.lateral_stiffness
     elastic = PHANTOM.yield_force / PHANTOM.lateral_stiffness
     torn = elastic + 2 * (PHANTOM.tear_force - PHANTOM.yield_force) / PHANTOM.lateral_stiffness

@@ -1,7 +1,7 @@
 """Visibility: at the end of a successful subtask the views of the world show the needle.
 
-"front", "back" and both eyes of the endoscope, and the crops of these about the active arm, where
-it is larger.
+The views are "front", "back", both eyes of the endoscope, and the eyes' crops around the active
+arm, where the needle is larger.
 """
 
 import pytest
@@ -13,7 +13,7 @@ from surgicai_vision.demos.expert import Expert
 
 SEEDS = range(8)
 PIXELS = 25
-"""Fewest needle pixels at 224 × 224."""
+"""Least number of needle pixels at 224 × 224."""
 
 
 @pytest.mark.parametrize("task", ["grasp", "place", "insert", "handoff"])

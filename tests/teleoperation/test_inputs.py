@@ -1,4 +1,4 @@
-"""Inputs: keys and sticks become inputs, and inputs motions along the axes that the person sees."""
+"""Inputs: keys and sticks become inputs; inputs become motions along the axes the person sees."""
 
 import numpy as np
 import pytest
@@ -100,7 +100,7 @@ def test_a_key_moves_the_tool_along_its_cameras_axis(grasp, view, axis):
     camera = extrinsics(grasp.model, grasp.data, view)[:3, :3]
     before = np.array(grasp.simulation.tip("psm2")[:3])
     mapping = InputMapping(grasp, speed=1.0)
-    # A wrist camera goes along: only the first steps are along where it looked first.
+    # A wrist camera moves with the tool: only the first steps follow its initial axes.
     for _ in range(8):
         grasp.step(mapping.action(Input(tuple(float(i == axis) for i in range(3))), view))
     moved = camera.T @ (np.array(grasp.simulation.tip("psm2")[:3]) - before)

@@ -1,4 +1,4 @@
-"""Teleoperation of the real env by scripted operators: what was kept is what happened."""
+"""Teleoperation of the real env by scripted operators: the kept recordings are what happened."""
 
 import itertools
 

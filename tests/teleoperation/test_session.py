@@ -1,4 +1,4 @@
-"""Sessions driven by scripted inputs: what was kept is demonstrations like any others."""
+"""Sessions driven by scripted inputs: kept episodes are demonstrations like any others."""
 
 import json
 import os

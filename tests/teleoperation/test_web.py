@@ -133,7 +133,7 @@ def web():
 
 
 def ask(web, path, method="GET", body=None, token=None, **headers):
-    """Return status, headers and body of an answer."""
+    """Send a request; return the answer's status, headers and body."""
     connection = http.client.HTTPConnection("127.0.0.1", web.server.port, timeout=10)
     connection.request(
         method, f"/{web.server.token if token is None else token}/{path}", body, headers
@@ -225,7 +225,7 @@ def test_broken_inputs_are_refused_and_the_server_lives(web, body, status):
 
 
 def status_of(config=SHORT):
-    """A session's status."""
+    """Return a session's status."""
 
     class Nowhere:
         seeds, next_seed = (), 3
@@ -357,7 +357,7 @@ def test_the_command_records_stops_and_sums_up(tmp_path):
 
 
 class Painted:
-    """Views of the stand-in env: grey as its state."""
+    """Views of the stand-in env, whose grey level is its state."""
 
     def __init__(self, env):
         self.env = env

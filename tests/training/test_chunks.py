@@ -1,4 +1,4 @@
-"""Chunks of actions: their column, their policies, and how they are acted."""
+"""Chunks of actions: their column, their policies, and how they are executed."""
 
 from dataclasses import replace
 from functools import partial
@@ -39,7 +39,7 @@ QUICK = ChunkRecipe(epochs=8, batch_size=32, learning_rate=1e-2, chunk=4, execut
 
 
 class Linear(ChunkPolicy):
-    """A chunk that is linear in what is seen, with a draw of its own on top."""
+    """A policy whose chunk is linear in its inputs, plus a random draw."""
 
     def __init__(self, recipe: ChunkRecipe, visual: tuple[tuple[int, ...], ...]):
         super().__init__(recipe, visual, "min_max")
@@ -69,7 +69,7 @@ LINEAR = Plugin(
 
 @final
 class Draws(Linear):
-    """A chunk of which nothing is seen: every row is drawn."""
+    """A policy that ignores its inputs: every row is drawn at random."""
 
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
         assert len(visual) == len(vector)
@@ -276,7 +276,7 @@ class Brightness:
 
 
 def moved(agent: ChunkAgent, steps: int) -> list[float]:
-    """Return the first value of each action while the arm moves by 1 a step."""
+    """Return the first value of each action while the arm moves by 1 per step."""
     arm = SimpleNamespace(agent_pos=lambda: np.full(7, arm.step, np.float32), step=0)
     actions = []
     for arm.step in range(steps):
@@ -287,7 +287,7 @@ def moved(agent: ChunkAgent, steps: int) -> list[float]:
 def test_the_beginning_of_a_chunk_is_executed_and_then_planned_anew() -> None:
     agent, seeds = acting(replace(QUICK, execute=3, frame_stride=2))
     agent.reset(0, None, 7)
-    # Plans at 0, 3 and 6; the earlier observation is two steps back, at the start the first.
+    # Plans at 0, 3 and 6; the earlier observation is two steps back, or the first at the start.
     assert moved(agent, 7) == [0, 1, 2, 310, 311, 312, 640]
     assert len(set(seeds)) == 3
     agent.restart(0)
@@ -330,7 +330,7 @@ def test_images_are_looked_at_while_they_can_be_shown(
         [max(0, tick - back * spacing) for back in range(history - 1, -1, -1)] for tick in due
     ]
     assert planned == wanted
-    # Nothing is looked at that no plan sees: the last steps' plans lie beyond the end.
+    # Only what some plan sees is looked at; the plans of the last steps lie beyond the end.
     ahead = range(0, 20 + spacing * history, execute)
     seen = {max(0, tick - back * spacing) for tick in ahead for back in range(history)}
     assert looked_at == sorted(step for step in seen if step < 20)

@@ -23,7 +23,7 @@ RECIPES = {"bc": "endoscope", "act": "act", "diffusion": "diffusion", "vqbet": "
 
 
 def train_small(policy: str, out: Path, device: str, stop_after: int = 0) -> None:
-    """Train a policy for seven epochs on maps; one that is stopped leaves its state in `out`."""
+    """Train a policy for seven epochs on maps; a stopped training leaves its state in `out`."""
 
     def stop(epoch: int, _: dict[str, float]) -> None:
         if epoch == stop_after:

@@ -1,4 +1,4 @@
-"""The high-level policy: progress beside the subtask, calibration, errors on held-out frames."""
+"""The high-level policy: progress alongside the subtask, calibration, errors on held-out frames."""
 
 from dataclasses import replace
 from pathlib import Path

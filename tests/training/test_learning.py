@@ -47,7 +47,7 @@ class Dataset(FakeData):
     def columns(self) -> dict[str, np.ndarray]:
         noise = np.random.default_rng(1).normal(size=(self.length, 49)).astype(np.float32)
         phase = np.tile(np.repeat(np.arange(5), 2), 4)
-        noise[:, 7:21] += 5 * phase[:, None]  # both arms tell the phase
+        noise[:, 7:21] += 5 * phase[:, None]  # both arms reveal the phase
         return {
             names.STATE: noise[:, :7],
             names.BOTH_ARMS: noise[:, 7:21],
@@ -62,7 +62,7 @@ class Dataset(FakeData):
 
 @pytest.fixture(autouse=True)
 def noise(tiny_encoder: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run in an empty folder, on a dataset of noise, with a tiny encoder and a cache of its own."""
+    """Run in an empty folder on a dataset of noise, with a tiny encoder and a separate cache."""
 
     def open_dataset(folder: str | None, task: str, views: tuple[str, ...]) -> Dataset:
         for view in views:
@@ -185,7 +185,7 @@ def test_controls_are_named_by_what_they_see(capsys: pytest.CaptureFixture[str])
 def test_high_level_policy_learns_the_phase(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    due = functools.partial(visits.subtasks_due, ahead=0)  # these episodes are too short for it
+    due = functools.partial(visits.subtasks_due, ahead=0)  # these episodes are too short to shift
     monkeypatch.setattr(visits, "subtasks_due", due)
     arguments = ("train", "--task", "suture", "--policy", "hlp", "--encoder", "none")
     folder = run(capsys, *arguments, "--epochs", "60", "--recipe", "paper")["checkpoint"]
@@ -210,14 +210,14 @@ def test_a_low_level_policy_is_warned_of_what_teaches_a_high_level_one(
 
 
 def test_a_subtasks_time_counts_from_the_beginning_of_each_visit() -> None:
-    """Of an episode in which a subtask is visited twice, and of two that end and begin with it."""
+    """For an episode that visits a subtask twice, and for two that end and begin with it."""
     rows = np.array([3, 4, 5, 9, 10, 20, 21, 22])
     episode = np.array([0, 0, 0, 0, 0, 0, 1, 1])
     assert first_of_visit(rows, episode).tolist() == [0, 0, 0, 3, 3, 5, 6, 6]
     whole = Dataset()
     phase = whole.columns()[names.PHASE]
     once = of_subtask(whole, "insert").columns()
-    # Visited once, it is what counting from the episode's first frame of the subtask gives.
+    # With one visit this equals counting from the episode's first frame of the subtask.
     kept = np.flatnonzero(phase == 2)
     index = whole.columns()["frame_index"][kept]
     first = np.searchsorted(whole.episode_index[kept], whole.episode_index[kept], side="left")

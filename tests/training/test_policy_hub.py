@@ -1,4 +1,4 @@
-"""Policies are pushed and pulled, against a Hub that is a folder."""
+"""Policies are pushed to and pulled from a Hub that is a folder."""
 
 import json
 from pathlib import Path

@@ -33,7 +33,7 @@ RUN = RunConfig(TaskConfig(names.SUTURE), changes=("epochs=1", "progress_input=t
 
 @pytest.fixture(scope="module")
 def says(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the checkpoint of a policy that says the progress."""
+    """Return the checkpoint of a policy that predicts the progress."""
     out = tmp_path_factory.mktemp("says") / "hlp"
     train(fake_procedures(2), [], HLP, QUICK, out=out)
     return out
@@ -41,7 +41,7 @@ def says(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fed(says: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the checkpoint of a policy of grasping that is fed it."""
+    """Return the checkpoint of a grasping policy that gets this progress as an input."""
     out = tmp_path_factory.mktemp("fed") / "grasp"
     train_run(RUN, fake_procedures(2), out, silent_stage, progress_from=says, subtask="grasp")
     return out

@@ -48,7 +48,7 @@ def tensors_of(folder: Path) -> bytes:
 
 
 def stop(done: int, total: int) -> None:
-    """Break a training off after its seventh epoch, as `progress`."""
+    """Interrupt a training after its seventh epoch, as its `progress`."""
     if done == 7:
         raise KeyboardInterrupt
 
@@ -62,7 +62,7 @@ def test_paper_recipe_is_the_paper() -> None:
 @pytest.mark.parametrize("name", recipe_names())
 def test_every_recipe_loads(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     policy = "hlp" if name == "high-level" else "bc"
-    if name in policy_names():  # LeRobot's, whose import takes long
+    if name in policy_names():  # LeRobot's, which are slow to import
         plugin = Plugin(name, ChunkRecipe, BC.make)
         monkeypatch.setattr(policies, "policy_plugin", lambda _: plugin)
     assert isinstance(load_recipe(policy, name), Recipe)
@@ -345,7 +345,7 @@ def test_epoch_checkpoints_and_fine_tuning(tmp_path: Path) -> None:
     "axes", [{"appearance": "heldout"}, {"appearance": "liver"}, {"appearance_shift": 0.1}]
 )
 def test_held_out_looks_are_refused(tmp_path: Path, axes: dict[str, Any]) -> None:
-    """Images of them; a policy that sees none may train."""
+    """With images of them; a policy that sees no images may train."""
 
     def recorded(**axes: Any) -> FakeDataset:
         randomisation = RandomisationConfig(**axes)
@@ -429,7 +429,7 @@ def test_another_encoder_or_task_is_refused(tmp_path: Path) -> None:
 
 
 def odd_policy(recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> Policy:
-    """A policy that gives two values too few."""
+    """Return a policy that gives two values too few."""
     policy = BC.make(recipe, visual)
     forward = policy.forward
     policy.forward = lambda observed: forward(observed)[:, :5]  # type: ignore[method-assign]

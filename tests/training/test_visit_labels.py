@@ -12,7 +12,7 @@ Columns = dict[str, np.ndarray]
 
 
 def episode(*visits: tuple[int, int], success: int = 1) -> Columns:
-    """Return an episode of (phase, control steps) each; its last `success` steps met the task."""
+    """Return an episode of (phase, control steps) visits; its last `success` steps met the task."""
     phase = np.concatenate([np.full(steps, phase) for phase, steps in visits])
     steps = np.arange(len(phase))
     return {
@@ -23,7 +23,7 @@ def episode(*visits: tuple[int, int], success: int = 1) -> Columns:
 
 
 def joined(*episodes: Columns) -> tuple[Columns, np.ndarray]:
-    """Return the columns of several episodes, and their numbers."""
+    """Return the columns of several episodes, and the episode number of every row."""
     index = np.repeat(np.arange(len(episodes)), [len(one[names.PHASE]) for one in episodes])
     return {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}, index
 
@@ -133,7 +133,7 @@ def test_thinned_frames_have_the_labels_of_their_time() -> None:
     kept = whole[position % 5 == 0]
     np.testing.assert_array_equal(target[:, 0], kept[:, 0])
     np.testing.assert_array_equal(target[:, 1] < 0, kept[:, 1] < 0)
-    # The end of a visit is known to the next frame that is there.
+    # The end of a visit is known only from the next kept frame.
     assert np.abs(target[:, 1] - kept[:, 1]).max() <= 5 / (30 - DWELL)
 
 
