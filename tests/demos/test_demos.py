@@ -334,7 +334,7 @@ def test_record_continues_where_it_was_stopped(tmp_path, fake, monkeypatch):
 def test_record_gives_up_on_an_expert_that_fails(tmp_path, fake, monkeypatch):
     monkeypatch.setattr(FakeExpert, "action", lambda self: np.zeros(7, np.float32))
     with pytest.raises(
-        SurgicaiError, match=r"succeeded at 0 of \d+ starts of grasp; 2 were wanted \(seed 0: no"
+        SurgicaiError, match=r"succeeded at 0 of \d+ starts of grasp; 2 were requested \(seed 0: no"
     ):
         record(CONFIG, episodes=2, out=tmp_path / "demos", context=RunContext(0))
 

@@ -139,7 +139,7 @@ def test_importing_again_does_nothing_and_another_file_is_refused(tmp_path, reco
 @pytest.mark.parametrize("task", ["grasp", "place", "insert", "pullout"])
 def test_a_task_the_motion_contradicts_is_refused(tmp_path, recording, task):
     with pytest.raises(
-        InputError, match=f"no {task}: it moves psm1 .* 0.80 rad; that fits handoff"
+        InputError, match=f"not of {task}: it moves psm1 .* 0.80 rad; that fits handoff"
     ):
         import_demos(recording, task=task, out=tmp_path / "demos")
     assert not (tmp_path / "demos").exists()

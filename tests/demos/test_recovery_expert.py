@@ -157,7 +157,7 @@ def frames_without_needle(demo):
 
 
 def test_who_goes_back_to_nothing_is_never_late(tmp_path):
-    with pytest.raises(InputError, match="late is 9, and demonstrator 'expert'"):
+    with pytest.raises(InputError, match="late is 9, but demonstrator 'expert'"):
         record(SUTURE, episodes=1, out=tmp_path / "a", disturbance=Disturbance(late=9))
     with pytest.raises(InputError, match="late is -1"):
         Disturbance(late=-1)

@@ -335,7 +335,10 @@ def test_the_expert_sews_in_the_corners(arc, sign):
     [
         ({"randomization": {}}, "Did you mean 'randomisation'"),
         ({"randomisation": [1.0]}, "must be a dict"),
-        ({"randomisation": {"phantom_shift": [0.001]}}, "phantom_shift has 2 numbers; 1 are given"),
+        (
+            {"randomisation": {"phantom_shift": [0.001]}},
+            "phantom_shift takes 2 numbers; 1 are given",
+        ),
         ({"randomisation": {"phantom_shift": 0.001}}, "phantom_shift is 0.001; give a list of 2"),
         ({"randomisation": {"phantom_turn": ["left"]}}, "phantom_turn is .* finite numbers"),
         ({"randomisation": {"phantom_turn": [math.nan]}}, "phantom_turn is .* finite numbers"),
