@@ -77,9 +77,14 @@ class Condition:
         """The encoder, then everything unusual: what is not bc, global, paper.
 
         Inputs and demonstrations are left out. A recipe with the same name as the policy's kind is
-        not repeated.
+        not repeated; recipe paper is named if behaviour cloning changes it.
         """
-        usual = ((self.trained_by, "bc"), (self.pool, "global"), (self.recipe, "paper"))
+        is_changed = self.trained_by == "bc" and bool(self.changes)
+        usual = (
+            (self.trained_by, "bc"),
+            (self.pool, "global"),
+            (self.recipe, "" if is_changed else "paper"),
+        )
         parts = (
             self.encoder,
             f"hierarchical, {self.hierarchical} end" if self.hierarchical else "",

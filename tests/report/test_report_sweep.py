@@ -226,7 +226,7 @@ def test_a_cell_that_the_run_skipped_is_told_whatever_its_name(tmp_path):
     (tmp_path / "run.json").write_text(json.dumps(run))
     missing = collect(tmp_path, [RunState(skipped, "a", "to do")]).missing
     assert [(item.condition.label, item.state, item.reason) for item in missing] == [
-        ("clip · epochs=2 on front", "not run", "its licence")
+        ("clip · paper · epochs=2 on front", "not run", "its licence")
     ]
 
 
