@@ -99,9 +99,11 @@ class Act(LeRobotChunks):
     def build(self, recipe: ChunkRecipe) -> PreTrainedPolicy:
         """Return `ACTPolicy`."""
         if recipe.history != 1:
-            raise InputError(f"history is {recipe.history}; ACT sees the present moment alone: 1.")
+            raise InputError(
+                f"history is {recipe.history}; ACT sees only the present observation; use 1."
+            )
         if recipe.samples != 1:
-            raise InputError(f"samples is {recipe.samples}; ACT draws nothing, its plan is one: 1.")
+            raise InputError(f"samples is {recipe.samples}; ACT does not sample; use 1.")
         config = _config(
             ACTConfig,
             recipe,

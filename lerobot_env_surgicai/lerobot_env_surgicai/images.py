@@ -49,7 +49,7 @@ def check_identity(encoder: Encoder, weights_sha256: str, wanted: str, where: st
     if weights_sha256 and encoder.weights_sha256 != weights_sha256:
         raise InputError(
             f"{where} was trained on encoder '{encoder.card.name}' with weights sha256 "
-            f"{weights_sha256}, got {encoder.weights_sha256}; hand over the same file."
+            f"{weights_sha256}, got {encoder.weights_sha256}; give the same file."
         )
     if wanted and identity(encoder) != wanted:
         raise InputError(

@@ -82,7 +82,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
         except (RuntimeError, SafetensorError) as error:
             reason = " ".join(str(error).split())[:200]
             raise BadFile(
-                f"{pretrained_name_or_path} holds no whole weights of surgicai_bc ({reason})."
+                f"{pretrained_name_or_path} holds no complete weights of surgicai_bc ({reason})."
             ) from None
         return policy
 

@@ -40,11 +40,13 @@ class _Told:
 
     def setpoint(self) -> NDArray[np.float32]:
         """Refuse: LeRobot's batch does not hold it."""
-        raise InputError("LeRobot's env tells no set point; use 'surgicai-vision evaluate'.")
+        raise InputError(
+            "LeRobot's env does not provide set points; use 'surgicai-vision evaluate'."
+        )
 
     def both_arms(self) -> NDArray[np.float32]:
         """Refuse: LeRobot's batch holds one arm."""
-        raise InputError("LeRobot's env tells one arm; use 'surgicai-vision evaluate'.")
+        raise InputError("LeRobot's env provides only one arm; use 'surgicai-vision evaluate'.")
 
     def enter(self, phase: int) -> None:
         """Refuse: a subtask's policy changes no arm."""
@@ -66,7 +68,7 @@ class SurgicaiCheckpointPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy 
         if unknown:
             raise InputError(
                 f"{config.checkpoint} is fed {', '.join(sorted(unknown))}, which LeRobot's env "
-                "does not tell; use 'surgicai-vision evaluate'."
+                "does not provide; use 'surgicai-vision evaluate'."
             )
         self._agent = acting_agent(folder, WeightsSource.of(config.encoder_weights))
         if self._agent.depth:
@@ -88,7 +90,7 @@ class SurgicaiCheckpointPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy 
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Refuse: it is trained by `surgicai-vision train`."""
-        raise InputError("surgicai_checkpoint is trained by 'surgicai-vision train'.")
+        raise InputError("surgicai_checkpoint cannot be trained here; use 'surgicai-vision train'.")
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:

@@ -141,7 +141,7 @@ class Leader:
 
     def __init__(self, step: StepSize, leader: Mapping[str, str]):
         if not leader:
-            raise InputError("leader is empty; give it a joint and the way it moves the tip.")
+            raise InputError("leader is empty; give at least one joint and how it moves the tip.")
         sizes = (step.translation,) * 3 + (step.rotation,) * 3 + (step.jaw,)
         self._ways: dict[str, tuple[str, int, float]] = {}
         for joint, said in leader.items():

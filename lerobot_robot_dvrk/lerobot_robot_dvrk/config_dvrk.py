@@ -78,7 +78,7 @@ class DvrkConfig(RobotConfig):  # type: ignore[misc]  # mypy skips LeRobot
             check_camera(view)
         if self.task == names.SUTURE and not self.simulated:
             raise InputError(
-                "of the whole procedure only a served simulation says which arm is active; give "
+                "for the whole procedure, only a served simulation says which arm is active; give "
                 "the subtask."
             )
         if not self.simulated and not self.dead_man.startswith("/"):

@@ -108,7 +108,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
             SurgicaiError: no robot answers.
         """
         if self._stack is not None:
-            raise DeviceAlreadyConnectedError(f"{self} is connected already.")
+            raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         config = self.config
         drive = config.drive_config()
         with ExitStack() as stack:
@@ -261,7 +261,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         if problem:
             logger.warning("held: %s", problem)
         else:
-            logger.info("the guards let through")
+            logger.info("the guards let commands through")
 
     def _check_connected(self) -> None:
         if self._stack is None:

@@ -97,7 +97,7 @@ class SurgicaiPage(Teleoperator):  # type: ignore[misc]  # mypy skips LeRobot
             InputError: the port is not free.
         """
         if self._stack is not None:
-            raise DeviceAlreadyConnectedError(f"{self} is connected already.")
+            raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         with ExitStack() as stack:
             title = "A dVRK, by LeRobot"
             self._page = stack.enter_context(

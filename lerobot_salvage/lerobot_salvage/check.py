@@ -55,7 +55,7 @@ def check_dataset(path: Path, progress: Progress = silent) -> CheckReport:
         for row in files.rows
     ]
     if written != rows:
-        problems.append("meta/episodes: its rows are not the episodes of the data.")
+        problems.append("meta/episodes: its rows do not match the episodes in the data.")
     missing = [
         key
         for key, row in files.features.items()

@@ -180,7 +180,7 @@ def open_or_recover(file: Path, files: LeRobotFiles, scratch: Path) -> pq.Parque
     for writing in (LEROBOT, Writing(compression(files.schema, depth), False)):
         if recover(file, _sample(files), mended, writing):
             return pq.ParquetFile(mended)
-    raise ValueError("no whole row group in it")
+    raise ValueError("no complete row group in it")
 
 
 def _sample(files: LeRobotFiles) -> pa.Table:

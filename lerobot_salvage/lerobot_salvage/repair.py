@@ -85,7 +85,7 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress = sil
     if out is not None:
         check_output(out)
     elif _free(path, "broken") is None:
-        raise BadFile(f"100 broken datasets lie beside {path} already; give --out DIR.")
+        raise BadFile(f"100 broken datasets already lie next to {path}; give --out DIR.")
     work = work_folder(out or path)
     try:
         with claim(work):
@@ -129,8 +129,7 @@ def _write(
         data.close()
         if not rows:
             raise BadFile(
-                f"{files.path} cannot be repaired: not one episode is whole "
-                f"({_why(files.problems)})"
+                f"{files.path} cannot be repaired: no episode is complete ({_why(files.problems)})"
             )
         for key, videos in verifier.video_files.items():
             for number in sorted({row.videos[key][0] for row in rows}):

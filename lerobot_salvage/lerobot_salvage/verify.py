@@ -287,7 +287,7 @@ def _contents(column: pa.ChunkedArray) -> list[tuple[bytes | None, str | None]]:
 def _array(column: pa.ChunkedArray, features: Features, key: str) -> NDArray[np.generic]:
     """Return a column as (T,), (T, n), … ; text as objects."""
     if column.null_count:
-        raise _Unfit(f"{key} has {column.null_count} values missing.")
+        raise _Unfit(f"{key} has {column.null_count} missing values.")
     flat = column.combine_chunks()
     count = len(column)
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):

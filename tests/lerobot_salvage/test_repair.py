@@ -177,7 +177,7 @@ def torn(folder):
 
 DAMAGE = {
     "more counted": (counts_more, 3, "it counts 8 episodes"),
-    "rows missing": (fewer_rows, 3, "rows are not the episodes"),
+    "rows missing": (fewer_rows, 3, "rows do not match the episodes"),
     "torn": (torn, 2, "no footer"),
     "image spoilt": (
         lambda f: change(f / DATA, CAMERA, 8, {"bytes": b"no", "path": "x"}),
@@ -243,7 +243,7 @@ def test_a_whole_dataset_is_left_alone(tmp_path, foreign):
 def test_nothing_whole_is_one_line_and_changes_nothing(tmp_path, foreign):
     folder = shutil.copytree(foreign / "killed", tmp_path / "set")
     (folder / DATA).write_bytes(b"PAR1")
-    with pytest.raises(BadFile, match="not one episode is whole"):
+    with pytest.raises(BadFile, match="no episode is complete"):
         repair_dataset(folder)
     assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == ["set"]
     with pytest.raises(BadFile, match="which nothing can be read"):
