@@ -71,11 +71,11 @@ class FinishedEpisodes:
         if not (self.folder / OWNER).exists():
             self.folder.mkdir(exist_ok=True)
             files.write_json(self.folder / OWNER, self.owner)
-        told = {
+        content = {
             "row": dataclasses.asdict(episode.row),
             "visits": [dataclasses.asdict(visit) for visit in episode.visits],
         }
-        metadata = {"episode": json.dumps(told, default=_plain)}
+        metadata = {"episode": json.dumps(content, default=_plain)}
         arrays = {"steps": episode.film.steps, "states": episode.film.states}
         files.write_bytes(self._path(episode.row.seed), save(arrays, metadata))
 
@@ -119,9 +119,9 @@ def _read(path: Path) -> Episode:
             text = file.metadata()["episode"]
     except (SafetensorError, KeyError, TypeError) as error:
         raise BadFile(f"{path} is damaged ({error}).") from None
-    told = checked(parse_json(text, str(path)), dict, str(path))
-    row = checked(told.get("row"), dict, f"{path}: row")
-    visits = checked(told.get("visits"), list, f"{path}: visits")
+    content = checked(parse_json(text, str(path)), dict, str(path))
+    row = checked(content.get("row"), dict, f"{path}: row")
+    visits = checked(content.get("visits"), list, f"{path}: visits")
     return Episode(
         from_mapping(EpisodeMetrics, row, str(path)),
         film,

@@ -48,6 +48,9 @@ def evaluate_into(
 ) -> Row:
     """Evaluate, store everything in the folder `out` and return the summary.
 
+    Episodes that a killed evaluation of the same policy, code and starts has finished there are not
+    run again.
+
     Args:
         out: folder for rows, films and summary.
         spec: what is evaluated.
