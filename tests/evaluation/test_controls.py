@@ -1,4 +1,4 @@
-"""Controls: the state as the ceiling, the mean demonstration played blind."""
+"""Controls: the state as an upper bound, and the mean demonstration replayed blindly."""
 
 import json
 from types import SimpleNamespace

@@ -20,7 +20,7 @@ from surgicai_vision.training.run_config import Starts
 
 @pytest.fixture
 def policy_file(tmp_path: Path) -> Path:
-    """Return the file of an untrained hierarchical policy of short episodes."""
+    """Return the file of an untrained hierarchical policy with short episodes."""
     table = dict.fromkeys(names.SUBTASKS, "zero")
     table["hlp"] = checkpoint(tmp_path / "hlp", "suture", "hlp")
     path = tmp_path / "mine.yaml"
@@ -68,7 +68,7 @@ def test_every_pair_is_evaluated_once_and_the_best_is_a_policy(
 
 
 def train_again(folder: Path) -> None:
-    """Put other weights into the folder of a checkpoint."""
+    """Replace the weights in a checkpoint's folder."""
     stored = read_checkpoint(folder)
     others = {name: 2 * tensor for name, tensor in read_tensors(stored).items()}
     write_checkpoint(folder, stored, others)

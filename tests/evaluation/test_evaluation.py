@@ -1,6 +1,6 @@
 """Evaluation: rows do not depend on batch or workers.
 
-Errors are failures; the summary has its keys.
+Errors are failures; the summary has the promised keys.
 """
 
 import json
@@ -76,7 +76,7 @@ class FakeEnv:
 
 
 class FakeMonitor:
-    """Measures what the fake env's count says."""
+    """Derives its measures from the fake env's step count."""
 
     def __init__(self, env):
         self.env = env
@@ -126,7 +126,7 @@ def test_rows_are_in_the_order_of_seeds_for_any_batch(fake_envs):
     wanted = rows_of(evaluate(ZeroAgent, SHORT, seeds, batch=1, workers=1))
     assert [row.seed for row in wanted] == seeds
     for batch in (2, 4, 20):
-        # A distance that was never measured is not a number on both sides, so the text is compared.
+        # A distance that was never measured is NaN on both sides, so the text is compared.
         assert repr(rows_of(evaluate(ZeroAgent, SHORT, seeds, batch=batch, workers=1))) == repr(
             wanted
         )
@@ -141,7 +141,7 @@ def test_errors_are_failures_and_counted(fake_envs):
     for seed in (97, 98, 99):
         assert not rows[seed].success
         assert rows[seed].error
-    # A start that cannot be made is no divergence of the physics.
+    # A start that cannot be made is not a divergence of the physics.
     assert [rows[seed].failure for seed in (97, 98, 99)] == ["error", "physics", "physics"]
     result = summary(list(rows.values()))
     assert (result["successes"], result["errors"], result["failures"]) == (
@@ -229,7 +229,7 @@ def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
     assert rows[40].tissue_force_n == pytest.approx(1.2)
     assert rows[40].tissue_impulse_ns == pytest.approx(0.24)
     assert (rows[3].paper_success, rows[40].paper_success) == (True, False)
-    # Nothing of the episode before is left in one that could not start.
+    # An episode that could not start has no values of the episode before.
     assert np.isnan([rows[97].entry_mm, rows[3].exit_mm]).all() and rows[97].slip_mm == 0.0
     result = storage.write_evaluation(tmp_path, episodes, RunConfig(policy="zero"), {})
     half, zero = pytest.approx(0.5), pytest.approx(0.0)

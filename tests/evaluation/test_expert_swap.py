@@ -1,4 +1,4 @@
-"""Expert swap: the expert in the place of a failing policy lets the procedure go on."""
+"""Expert swap: the expert in place of a failing policy lets the procedure go on."""
 
 import json
 
@@ -68,7 +68,7 @@ def test_a_swapped_expert_lets_the_procedure_go_on_to_the_next_weak_link(
 
 
 def train_again(folder):
-    """Put other weights into the folder of a checkpoint."""
+    """Replace the weights in a checkpoint's folder."""
     stored = read_checkpoint(folder)
     others = {name: 2 * tensor for name, tensor in read_tensors(stored).items()}
     write_checkpoint(folder, stored, others)

@@ -1,4 +1,4 @@
-"""Filming: which episodes become videos, what they show, and that an evaluation stays the same."""
+"""Filming: which episodes become videos, what they show, and that evaluations do not change."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Finished episodes: a stopped evaluation goes on, and ends as if it had not been stopped."""
+"""Finished episodes: a stopped evaluation continues, and ends as if it had not been stopped."""
 
 import functools
 from dataclasses import replace
@@ -16,7 +16,7 @@ LAST = SEEDS[-1]
 
 
 class Watched(ZeroAgent):
-    """Lists the starts that it is given, and is stopped at one of them."""
+    """Records the starts that it gets, and is interrupted at one of them."""
 
     def __init__(self, begun, stopped_at=None):
         super().__init__()
@@ -42,7 +42,7 @@ def stop(out, task="grasp", filming=None, **changes):
 
 
 def contents(folder):
-    """Return what an evaluation's tables and films hold, byte for byte."""
+    """Return the bytes of an evaluation's tables and films."""
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix != ".json"}
 
 

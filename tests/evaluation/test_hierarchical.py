@@ -37,14 +37,14 @@ PRIVILEGED = {**EXPERTS, "termination": "privileged"}
 
 
 class Env:
-    """Counts what a hierarchical policy asks of it; a subtask succeeds after `length` steps."""
+    """Records the subtasks that a policy begins; a subtask succeeds after `length` steps."""
 
     def __init__(self, length: int = 3):
         self.length, self.phase, self.steps, self.begun = length, 0, 0, []
 
     @property
     def dwell(self) -> int:
-        """Steps for which the success has held: it comes after two."""
+        """Steps for which the success has held, which begins after two."""
         return max(0, self.steps - 2)
 
     def enter(self, phase: int) -> None:
@@ -59,7 +59,7 @@ class Env:
 
 
 class Constant(Agent):
-    """Says one value; keeps the slots whose subtask began anew."""
+    """Acts with one value; records the slots whose subtask restarted."""
 
     def __init__(self, value: float):
         self.value, self.restarted = value, []
@@ -75,7 +75,7 @@ class Constant(Agent):
 
 
 class Saying:
-    """A high-level policy that says `classes` in turn, each with a probability of `sure`."""
+    """A high-level policy that names `classes` in turn, each with a probability of `sure`."""
 
     cameras = ()
     image_size = 224
@@ -91,12 +91,12 @@ class Saying:
 
     def answer(self, robots, observations):
         logits = self.logits[[next(self.said) for _ in robots]]
-        progress = np.full((len(robots), 1), 9.0)  # beside the logits, and none of them
+        progress = np.full((len(robots), 1), 9.0)  # appended to the logits, not one of them
         return np.concatenate([logits, progress], axis=1).astype(np.float32)
 
 
 def agent(classes: list[int], sure: float = 0.9, **changes: object) -> HierarchicalAgent:
-    """Return a policy whose high level says `classes` in turn and whose low level its index."""
+    """Return a policy whose high level names `classes` in turn; each low level plays its index."""
     made = HierarchicalAgent(
         HierarchicalConfig("hlp", **{**PRIVILEGED, **changes}),
         [ExpertAgent] * 5,
@@ -107,13 +107,13 @@ def agent(classes: list[int], sure: float = 0.9, **changes: object) -> Hierarchi
 
 
 def learned(classes: list[int], sure: float = 0.9, **changes: object) -> HierarchicalAgent:
-    """Return the same with learned ends that ask in every step unless told otherwise."""
+    """Return the same with learned ends, which ask in every step by default."""
     how = {"termination": "learned", "decide_every": 1, "patience": 1, **changes}
     return agent(classes, sure, **how)
 
 
 def roll(actor: HierarchicalAgent, env: Env, steps: int) -> list[int]:
-    """Return which low-level policy acted in each step; -1 where the arms hold still."""
+    """Return which low-level policy acted in each step; 0 also where the arms hold still."""
     actor.reset(0, env, 0)
     acted = []
     for _ in range(steps):
@@ -194,7 +194,7 @@ def test_experts_in_their_order_sew_and_count_their_stages() -> None:
     assert made.config.task == "suture"
     row = evaluate(made.make_agent, made.config, [names.TEST_SEED], workers=1)[0].row
     assert row.success and row.stages == 5, row
-    # A grasp ends after five steps, the others after fifteen, the first of which is no delay.
+    # A grasp ends after five steps, the others after fifteen; the first step is not a delay.
     assert (row.false_ends, row.end_delay_s) == (0, pytest.approx(0.28))
     assert summary([row])["reached"] == dict.fromkeys(names.SUBTASKS, 1)
 
@@ -258,7 +258,7 @@ def test_policies_may_have_learned_in_worlds_that_vary_and_not_in_different_scen
 
 
 def written(folder: Path, hlp: str, low: dict[str, str]) -> Path:
-    """Write the file of a hierarchical policy that says nothing of its ends."""
+    """Write the file of a hierarchical policy without a choice of ends."""
     path = folder / "hierarchical.yaml"
     path.write_text(f"hlp: {hlp}\n" + "".join(f"{name}: {low[name]}\n" for name in low))
     return path

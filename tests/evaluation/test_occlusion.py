@@ -1,4 +1,4 @@
-"""Occlusion sensitivity: what matters is found, and nothing else; memory is kept apart."""
+"""Occlusion sensitivity: only what matters is found; each slot's memory is separate."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ CORNER = (slice(4, 12), slice(30, 38))
 
 
 class CornerAgent(Agent):
-    """Acts on one corner of one view, and on how often it was asked in the slot."""
+    """Acts on one corner of one view, and on how often the slot was queried."""
 
     name = "corner"
     cameras = ("front", "back")

@@ -32,12 +32,12 @@ class Still(Agent):
 
 
 def not_an_agent():
-    """Return something else."""
+    """Return something that is not an agent."""
     return 3
 
 
 def interrupted():
-    """Raise what is no error of ours."""
+    """Raise an exception that is not ours."""
     raise StopIteration
 
 

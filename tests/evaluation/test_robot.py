@@ -17,7 +17,7 @@ SEED = names.TEST_SEED
 
 
 class OnlyRobot:
-    """An env of which nothing is left but what `evaluation.agent.Robot` has."""
+    """An env reduced to the members of `evaluation.agent.Robot`."""
 
     def __init__(self, env):
         self.agent_pos, self.both_arms = env.agent_pos, env.both_arms
@@ -41,7 +41,7 @@ def policy(answers: np.ndarray, vector: tuple[str, ...]) -> PolicyAgent:
 def hierarchy(
     vector: tuple[str, ...] = (names.STATE, names.SETPOINT), **ends: object
 ) -> HierarchicalAgent:
-    """Return policies that play what the expert did, and say when it went on."""
+    """Return policies that replay the expert's actions and its changes of subtask."""
     played = expert_procedure(SEED)
     phases = np.array(played.phases)
     low = [
@@ -54,7 +54,7 @@ def hierarchy(
 
 
 def sew(agent: HierarchicalAgent) -> dict[str, object]:
-    """Run an episode; the agent has only a robot, the env goes on only when told."""
+    """Run an episode; the agent has only a robot, and the env advances only when told."""
     env = envs.make(TaskConfig("suture", advance="told"))
     env.reset(seed=SEED)
     robot = OnlyRobot(env)

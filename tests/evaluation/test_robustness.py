@@ -1,4 +1,4 @@
-"""Robustness: strength 0 is plain, strengths are paired, an axis changes what it says alone."""
+"""Robustness: strength 0 is plain, strengths are paired, an axis changes only what it names."""
 
 import json
 from contextlib import contextmanager
@@ -86,7 +86,7 @@ def test_an_axis_changes_what_a_seeing_policy_does_and_not_where_it_starts(axis)
     needles = [
         [needle_at_start(episode) for episode in episodes] for episodes in (plain, half, full)
     ]
-    # A needle's frame is the centre of its arc: with another radius it lies elsewhere.
+    # A needle's frame is at the centre of its arc, so it moves with the radius.
     near = needle.RADIUS * 0.2 + 1e-6 if "needle_size" in AXES[axis].world else 1e-6
     np.testing.assert_allclose(needles[1], needles[0], atol=near)
     np.testing.assert_allclose(needles[2], needles[0], atol=near)
@@ -108,7 +108,7 @@ def test_an_episode_keeps_its_direction_and_grows_with_the_strength(axis):
     assert set(drawn[0.5]) == set(drawn[1.0]) == set(AXES[axis].world)
     for name, values in drawn[1.0].items():
         half = drawn[0.5][name]
-        if name in LOOKS:  # how much of a look, then which
+        if name in LOOKS:  # first the amount of a look, then which look
             assert 0 <= half[0] <= values[0]
             assert half[0] == 0 or (half[1:] == values[1:]).all()
         elif name != "latency":
@@ -172,7 +172,7 @@ def test_rows_do_not_depend_on_the_batch(axis):
 
 
 class Watcher(Agent):
-    """Keeps what it sees and the slots whose subtask began anew."""
+    """Records what it sees and the slots whose subtask restarted."""
 
     name, cameras, image_size, depth = "watcher", ("front",), 8, True
 
@@ -216,7 +216,7 @@ def test_a_wrapper_passes_on_every_member_of_the_agent():
 
 
 class Pretend:
-    """Stands for `evaluate`: start s is solved up to strength s / 4; counts its calls."""
+    """Replaces `evaluate_into`: start s is solved up to strength s / 4; records its calls."""
 
     def __init__(self, real):
         self.real, self.calls = real, []

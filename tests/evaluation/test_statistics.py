@@ -1,6 +1,6 @@
 """Intervals and tests against SciPy's own and other formulas, on random tables.
 
-Nominal coverage, simulated.
+Coverage is checked by simulation and by exact sums.
 """
 
 import itertools
@@ -138,7 +138,7 @@ def test_bootstrap_of_one_seed_is_the_exact_interval():
 def korn_graubard(groups):
     """The interval of success counts with the bootstrap's error in closed form.
 
-    Infinitely many resamples.
+    It is the limit of infinitely many resamples.
     """
     p, seeds = np.mean([np.mean(g) for g in groups]), len(groups)
     rates, sizes = np.array([np.mean(g) for g in groups]), np.array([len(g) for g in groups])
@@ -238,7 +238,7 @@ def test_retention_is_the_ratio_of_rates_on_the_same_starts():
     ("both", "lost", "won"), [(0.5, 0.3, 0.05), (0.2, 0.6, 0.0), (0.85, 0.1, 0.02), (0.4, 0.2, 0.2)]
 )
 def test_the_interval_of_retention_covers_by_exact_sums(both, lost, won):
-    """All outcomes of 30 starts, weighed by their probability: at least 93 % are covered."""
+    """All outcomes of 30 starts, weighted by their probability: at least 93 % are covered."""
     n = 30
     truth = (both + won) / (both + lost)
     covered = 0.0

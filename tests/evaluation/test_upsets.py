@@ -33,10 +33,10 @@ def test_rows_say_what_went_wrong_when_and_whether_it_was_recovered():
     for row in rows:
         plan = plan_upset(row.seed, "grasp")
         assert plan is not None
-        # At the drawn step, or sooner where the jaws are near by then.
+        # At the drawn step, or sooner if the jaws come near before.
         assert row.upset == "push" and 0 <= row.upset_step <= plan.wait
         assert row.success and row.recovered
-    # The moment is the start's: the same in any batch.
+    # The moment depends on the start alone, not on the batch.
     alone = evaluate(ExpertAgent, GRASP, SEEDS[:1], batch=1, workers=1, upset=True)
     assert repr(as_table([alone[0].row])) == repr(as_table(rows[:1]))
     counts = summary(rows)["upsets"]

@@ -1,4 +1,4 @@
-"""Watch: the player plays what is counted; the page in a real browser; the window."""
+"""Watch: the player plays what is evaluated; the page in a real browser; the window."""
 
 import json
 import re
@@ -24,7 +24,7 @@ SHORT = TaskConfig("handoff", max_steps=6)
 
 
 class Recorder:
-    """Takes a player's curves."""
+    """Records a player's curves."""
 
     def __init__(self):
         self.episodes = []

@@ -1,4 +1,4 @@
-"""A run remembers the world that its policy learned in, and reports tell such policies apart."""
+"""A run records the world that its policy learned in, and reports distinguish such policies."""
 
 import itertools
 from dataclasses import replace
@@ -42,7 +42,7 @@ def test_what_a_run_remembers_does_not_depend_on_where_it_was_before(home, first
 def test_a_run_at_home_is_known_as_it_always_was():
     run = trained(MOVED)
     assert evaluated_in(run, MOVED) == run and "recorded_in" not in to_identity(run)
-    # What is no part of the world is no other world.
+    # A change outside the world is not another world.
     longer = replace(MOVED, max_steps=300)
     assert evaluated_in(run, longer).recorded_in is None
     expert = RunConfig(STANDING, policy="expert")
@@ -63,7 +63,7 @@ def test_one_policy_in_two_worlds_is_paired_and_two_policies_in_two_worlds_are_n
     )
     assert factor(home, away) == "world"
     assert factor(home, condition_of(trained(SOFT))) == ""
-    # In a plan the condition's name says the world.
+    # In a plan the condition's name identifies the world.
     named = [replace(item, name=name) for item, name in ((home, "a"), (away, "b"))]
     assert factor(*named) == "condition" and "tissue soft" not in named[1].label
     assert factor(named[0], replace(condition_of(trained(SOFT)), name="b")) == ""

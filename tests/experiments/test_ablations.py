@@ -38,7 +38,7 @@ def write(path, *lines):
 
 @pytest.fixture
 def ablated(tmp_path):
-    """A run that sees, one that does not, and five ablations."""
+    """A grid of a run with images, one without, and five ablations."""
     ablations = [
         "ablation:",
         "  - view: front",

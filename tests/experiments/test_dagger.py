@@ -1,4 +1,4 @@
-"""DAgger: a learner drives, the expert labels, and the seed decides whatever the workers."""
+"""DAgger: a learner drives, the expert labels; the seed, not the workers, decides the result."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ CONFIG = TaskConfig("place", max_steps=160)
 
 
 class Backwards:
-    """A learner that goes the wrong way, more wildly than it may."""
+    """A learner that goes the wrong way, with commands beyond the limit."""
 
     def reset(self, slot, env, seed):
         self.begun = seed

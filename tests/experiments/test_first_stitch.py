@@ -1,4 +1,4 @@
-"""The first act of a quickstart: what it writes is whole."""
+"""The first act of a quickstart: it leaves only complete files."""
 
 from contextlib import contextmanager
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Plans: a set of policies rebuilt from nothing for several training seeds, tiny, end to end."""
+"""Plans: a set of policies rebuilt from scratch for several training seeds, tiny, end to end."""
 
 import itertools
 import json
@@ -92,7 +92,7 @@ QUIET = QuietConsole().stage
 
 @contextmanager
 def eventful(title, unit):
-    """Kill a worker at the first policy, and interrupt after the first run."""
+    """Kill a worker after the first policy, and interrupt after the first run."""
 
     def progress(done, total, unit=""):
         if title == "policies" and done == 1:
@@ -120,7 +120,7 @@ def tiny():
 
 @pytest.fixture(scope="module")
 def quiet(tiny, tmp_path_factory):
-    """The plan built whole, one step after the other, and what the call returned."""
+    """The plan's folder, built without interruption, and the call's result."""
     out = tmp_path_factory.mktemp("plan") / "quiet"
     return out, sweep(tiny, out)
 
@@ -161,7 +161,7 @@ def test_a_field_of_an_env_stands_whole_in_the_place_of_the_plans_and_the_others
 
 
 def test_a_step_limit_of_demonstrations_is_no_evaluations():
-    """Each policy is evaluated with its task's, as its key says, the procedure with its own."""
+    """Each policy is evaluated with its task's limit, as in its key; the procedure has its own."""
     env = {"max_steps": 300, "hold_jaw": True}
     recorded = [{**each, "env": env} for each in TABLE["demonstrations"]]
     whole = {"name": "all", "view": ["back"], **WHOLE}  # one policy for the whole procedure
@@ -219,7 +219,7 @@ def test_a_policy_is_trained_on_what_the_plan_says(quiet, tiny):
 
 def test_the_result_depends_neither_on_workers_nor_on_kills(quiet, tiny, tmp_path):
     out = tmp_path / "out"
-    shutil.copytree(quiet[0] / "data/seed1", out / "data/seed1")  # recording has tests of its own
+    shutil.copytree(quiet[0] / "data/seed1", out / "data/seed1")  # recording is tested separately
     shutil.copy(quiet[0] / "sweep.json", out)
     only = ("seed=1", "condition=standing")
     with pytest.raises(KeyboardInterrupt):

@@ -1,4 +1,4 @@
-"""Plans that name another they differ from."""
+"""Plans that name a base and change some keys."""
 
 from dataclasses import replace
 
@@ -53,7 +53,7 @@ def test_soft_tissue_takes_the_endoscopes_plan_as_it_is():
         ({**OWN, "base": "endoscop"}, "Did you mean 'endoscope'"),
         ({**OWN, "base": "endoscope-soft"}, "has a base itself"),
         ({**OWN, "polices": []}, "Did you mean 'policies'"),
-        ({**OWN, "base": "smoke"}, "task"),  # a grid, whose keys no plan has
+        ({**OWN, "base": "smoke"}, "task"),  # a grid; its keys are not a plan's
         ({**OWN, "base": ["endoscope"]}, "Unknown sweep"),
     ],
     ids=lambda value: str(value)[:40],

@@ -48,7 +48,7 @@ def tiny():
 
 @pytest.fixture(scope="module")
 def swept(tiny, tmp_path_factory):
-    """The plan done whole, and what the call returned."""
+    """The finished plan's folder, and the call's result."""
     out = tmp_path_factory.mktemp("learner") / "out"
     return out, run_sweep(tiny, out, RunContext(0, stage=QuietConsole().stage))
 

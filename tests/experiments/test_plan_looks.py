@@ -55,7 +55,7 @@ def tiny():
 
 @pytest.fixture(scope="module")
 def swept(tiny, tmp_path_factory):
-    """The plan done whole, and what the call returned."""
+    """The finished plan's folder, and the call's result."""
     out = tmp_path_factory.mktemp("looks") / "out"
     return out, run_sweep(tiny, out, RunContext(0, stage=QuietConsole().stage))
 
@@ -120,7 +120,7 @@ def test_the_report_tells_looks_and_multiplied_demonstrations_apart(swept, tiny)
 
 
 def test_what_a_plan_does_not_use_is_no_part_of_its_keys():
-    """Golden keys of before demonstrations had looks: a sweep that was begun then goes on."""
+    """Golden keys from before demonstrations had looks: sweeps begun then still continue."""
     whole = {"name": "whole", "task": "suture", "episodes": 2, "view": ["back"]}
     parts = ("grasp", "place", "insert", "handoff", "pullout")
     policies = [{"name": name, "demonstrations": "whole", "subtask": name} for name in parts]

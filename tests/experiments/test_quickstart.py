@@ -1,4 +1,4 @@
-"""The whole flow, tiny: quickstart and sweep from nothing, and once more without work."""
+"""The whole flow, tiny: quickstart and sweep from scratch, then again without work."""
 
 import io
 import json
@@ -29,7 +29,7 @@ TINY = {
 }
 GRID = {
     "task": ["grasp"],
-    "encoder": ["r3m"],  # its weights are nowhere here; the cells that run need no images
+    "encoder": ["r3m"],  # its weights are not available; the cells that run need no images
     "view": ["back"],
     "seed": [0, 1],
     "proprioception": True,
@@ -41,7 +41,7 @@ GRID = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with the configurations and a feature cache of its own."""
+    """A folder with the configurations and its own feature cache."""
     path = tmp_path_factory.mktemp("flow")
     (path / "tiny.yaml").write_text(yaml.safe_dump(TINY))
     (path / "grid.yaml").write_text(yaml.safe_dump(GRID))
@@ -76,7 +76,7 @@ def test_a_quickstart_without_policies_is_refused():
 
 
 def times(folder):
-    """Modification times of every file below `folder`, but for the page and the run's own times."""
+    """Modification times of every file below `folder`, except the page and the run's record."""
     paths = [os.path.join(root, name) for root, _, found in os.walk(folder) for name in found]
     return {
         path: os.stat(path).st_mtime_ns
@@ -111,7 +111,7 @@ def test_the_first_act_is_a_whole_procedure_by_whom_the_page_names(folder, first
     frames = read_video(folder / "out/procedure/procedure.mp4")
     assert len(frames) > 25 * sewn["subtasks"][-1]["end_s"] and frames[0].any()
     with PIL.Image.open(folder / "out/procedure/procedure.webp") as moving:
-        # Half of the video's 25 images a second; those at the end, all alike, are one.
+        # Half of the video's 25 images per second; identical ones at the end become one.
         assert moving.n_frames > 12 * sewn["subtasks"][-1]["end_s"] and moving.info["loop"] == 0
     assert (folder / "out/procedure/procedure.webp").stat().st_size < 3e6
     page = (folder / "out/report.html").read_text()
@@ -164,4 +164,4 @@ def test_sweep_runs_reports_and_resumes(folder):
     page = (folder / "sweep/report.html").read_text()
     assert page.split('id="missing"')[1].split('id="origin"')[0].count("r3m on back") == 1
     states = pq.read_table(folder / "sweep/tables/cells.parquet")["state"].to_pylist()
-    assert sorted(states) == ["done", "done", "done", "not run", "not run"]  # the expert too
+    assert sorted(states) == ["done", "done", "done", "not run", "not run"]  # including the expert

@@ -1,4 +1,4 @@
-"""`release`, tiny, from nothing to the cards; `policies`; and what every released policy keeps."""
+"""`release`, tiny, from scratch to the cards; `policies`; and checks of released policies."""
 
 import contextlib
 import io
@@ -53,7 +53,7 @@ def folder(tmp_path_factory):
 
 @contextlib.contextmanager
 def working_in(folder: Path) -> Iterator[None]:
-    """Work in the folder, with policies and features of its own."""
+    """Work in the folder, with its own policies and features."""
     with pytest.MonkeyPatch.context() as patch:
         work_in(folder, patch)
         yield
@@ -68,13 +68,13 @@ def work_in(folder: Path, patch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def here(folder, monkeypatch):
-    """Work in the folder, by the patches a test may add to: they are undone in turn."""
+    """Work in the folder, by the test's own `monkeypatch`: patches are undone in order."""
     work_in(folder, monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def built(folder):
-    """What the command says that builds all policies; they are there from then on."""
+    """The result of the command that builds all policies, which then stay there."""
     said = io.StringIO()
     with working_in(folder), contextlib.redirect_stdout(said):
         assert main([*COMMAND, "--json"]) == 0
@@ -104,7 +104,7 @@ def as_built(built):
 
 
 def test_nothing_is_released_before_it_is_built(tmp_path, capsys):
-    with pytest.MonkeyPatch.context() as patch:  # undone before `here` is, whatever else patches
+    with pytest.MonkeyPatch.context() as patch:  # undone before `here`, whatever else is patched
         patch.setenv(released.VARIABLE, str(tmp_path / "released"))
         with pytest.raises(InputError, match=r"no policy is released .* `surgicai-vision release`"):
             open_policy("released:grasp")
@@ -119,7 +119,7 @@ def test_one_command_builds_all_and_continues_where_it_was(built, capsys):
     (stored,) = Path("outputs/release").glob("*/plan.json")
     whole = json.loads(stored.read_text())
     earlier = {key: whole[key] for key in whole if key in (*PLAN, "env")}
-    stored.write_text(json.dumps({**earlier, "seed": 0}))  # before there were conditions
+    stored.write_text(json.dumps({**earlier, "seed": 0}))  # as stored before conditions existed
     code, again = run(capsys, *COMMAND)
     assert code == 0 and again == built
     assert [path.stat().st_mtime_ns for path in work if path.name != "plan.json"] == times

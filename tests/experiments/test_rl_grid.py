@@ -1,4 +1,4 @@
-"""Sweeps over algorithms: the runs of the shipped files, and one sweep from demonstrations on."""
+"""Sweeps over algorithms: the runs of the shipped files, and one sweep from its demonstrations."""
 
 import json
 import shutil

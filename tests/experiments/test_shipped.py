@@ -1,4 +1,4 @@
-"""The policies that come with the package: what their cards say is so."""
+"""The policies that come with the package: what their cards say is true."""
 
 import pytest
 
@@ -12,7 +12,7 @@ from surgicai_vision.training import released
 PLAN = read_plan()
 COUNTED = (*(policy.name for policy in PLAN.policies if policy.acts), names.SUTURE)
 SUTURES_SEWN = 2
-"""Whole procedures that are sewn here: one takes as long as five subtasks."""
+"""Whole procedures to sew here: one takes as long as five subtasks."""
 
 
 def test_what_is_shipped_is_what_the_plan_builds():

@@ -55,7 +55,7 @@ BLIND = Grid(
     episodes=1,
     size=32,
 )
-"""Four runs that see nothing: half a second each."""
+"""Four runs without images: half a second each."""
 GROWING = RLGrid(("grasp",), ("bc",), seed=(0, 1), demonstrations=(1,), updates=2, episodes=1)
 """A sweep to which seeds may be added."""
 
@@ -66,7 +66,7 @@ def sweep(grid, out, workers=0, stage=QUIET, only=()):
 
 
 def store_table(experiment, out):
-    """Make a folder the experiment's."""
+    """Write the experiment's table into a folder."""
     out.mkdir(exist_ok=True)
     files.write_json(out / GRID_FILE, {"format": FORMAT, experiment.kind: dict(experiment.table())})
 
@@ -470,7 +470,7 @@ def test_a_sweep_of_another_version_is_refused(tmp_path):
 
 
 def loaded_parts(modules, depth):
-    """Return the names at `depth` below the package of all its modules that importing loads."""
+    """Return the names, `depth` levels below the package, of all modules that importing loads."""
     code = f"import sys, {', '.join(modules)}; print(*sys.modules)"
     said = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
@@ -480,7 +480,7 @@ def loaded_parts(modules, depth):
 
 
 def test_keys_count_every_module_that_can_change_a_run():
-    """What a worker imports for a run is counted in its key, or named here as harmless."""
+    """What a worker imports for a run is part of its key, or named here as harmless."""
     modules = ("surgicai_vision.experiments.sweep.jobs", "surgicai_vision.demos.record")
     loaded = {package for (package,) in loaded_parts(modules, 1)}
     counted = set(JOBS["sweep-run"].stages)
@@ -497,6 +497,6 @@ def test_keys_count_every_module_of_core_that_can_change_a_run():
     )
     loaded = {module for package, module in loaded_parts(modules, 2) if package == "core"}
     harmless = {"errors", "executor", "files", "lazy", "plugins", "processes", "progress"}
-    harmless |= {"banks", "untrusted", "yaml_text"}  # what they give is in the arguments of a job
+    harmless |= {"banks", "untrusted", "yaml_text"}  # their results are in the arguments of a job
     assert loaded - {path.stem for path in files.SHARED} - harmless == set()
     assert all(path.is_file() for path in files.SHARED)

@@ -1,4 +1,4 @@
-"""The shipped sweeps of looks never seen and of few demonstrations: what they record and count."""
+"""The shipped sweeps of unseen looks and of few demonstrations: what they record and evaluate."""
 
 import json
 from collections import Counter

@@ -1,4 +1,4 @@
-"""The yardstick: a plan whose rows share starts, with what cannot be run listed beside them."""
+"""The yardstick: a plan whose rows share starts, and which lists what cannot be run."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The feature cache: encode once, resume, never meet an old entry."""
+"""The feature cache: encode once, resume, never use an outdated entry."""
 
 import errno
 import json
@@ -38,7 +38,7 @@ class FakeDataset(FakeData):
 
 
 class FakeEncoder:
-    """Three numbers a frame; counts what it sees."""
+    """Gives three numbers per frame; counts its frames."""
 
     card, pool, dim, shape = CARD, "global", 3, (3,)
 
@@ -141,7 +141,7 @@ def test_every_block_is_taken_before_a_row_is_written(
 ) -> None:
     long = FakeDataset(length=20_000)
     monkeypatch.setattr(module, "CHUNK", 10_000)
-    if killed:  # by a release that took none: the rows are a hole
+    if killed:  # by a release that reserved no blocks: the file is sparse
         folder = tmp_path / "features" / entry_key(long, "front", FakeEncoder())
         folder.mkdir(parents=True)
         np.lib.format.open_memmap(folder / "features.npy", "w+", np.float16, (20_000, 3))

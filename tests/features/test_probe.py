@@ -1,4 +1,4 @@
-"""The linear probe: in features that hold the pose, in noise, and what it refuses."""
+"""The linear probe: on features that hold the pose, on noise, and what it refuses."""
 
 import json
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ from surgicai_vision.scene.needle import HOME, TIP_ANGLE, point
 
 
 def poses(episodes: int, frames: int, seed: int = 0) -> np.ndarray:
-    """A needle that lies still in every episode, each at another place and angle, (N, 7)."""
+    """Poses (N, 7) of a needle that lies still, at a different place and angle in each episode."""
     generator = np.random.default_rng(seed)
     rows = []
     for _ in range(episodes):
@@ -73,7 +73,7 @@ def test_features_that_hold_the_pose_are_read_and_noise_is_not() -> None:
 
 
 def test_an_episodes_identity_does_not_help() -> None:
-    """Features that only identify the episode fit the known ones and fail on those held out."""
+    """Features that only identify the episode fit training episodes and fail on held-out ones."""
     dataset = Dataset()
     identity = np.eye(20)[dataset.episode_index]
     found = probe(dataset, [features(identity, dataset)])
@@ -89,7 +89,7 @@ def test_views_stand_side_by_side() -> None:
 
 
 def test_proprioception_places_what_a_crop_shows() -> None:
-    """Features that say where the tip is beside the jaws need to know where the jaws are."""
+    """Features that place the tip relative to the jaws also need the position of the jaws."""
     generator = np.random.default_rng(3)
     dataset = Dataset()
     position, _ = _targets(dataset.pose)

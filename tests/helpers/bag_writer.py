@@ -1,4 +1,4 @@
-"""Bags made of our own expert's demonstrations, with the writers of `rosbags`."""
+"""Bags made from our own expert's demonstrations, with the writers of `rosbags`."""
 
 import functools
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ class Motion:
 
 @functools.cache
 def shown(task, seed=0):
-    """Return the motion of our expert's episode; made once."""
+    """Return the motion of our expert's episode; cached."""
     env = envs.make(TaskConfig(task))
     result = rollout(env, Expert(env), seed)
     assert result.success
@@ -103,15 +103,15 @@ def write_bag(
     """Write streams as a bag.
 
     Args:
-        path: of the bag; the ending is added to that of ROS 1.
+        path: of the bag; a ROS 1 bag gets its suffix.
         form: one of `FORMATS`.
         found: role → (times [ns], values).
         topics: role → topic.
         types: kind of role → message type.
-        late: by how much later than stamped a message is received, at most [ns], drawn at random.
+        late: largest delay from a message's stamp to its receipt [ns]; delays are random.
         frame: frame_id of the headers.
-        stamped: the headers have stamps.
-        packed: packed by zstd, or for ROS 1 by "bz2" or "lz4".
+        stamped: whether the headers have stamps.
+        packed: "" for no compression; else zstd, or for ROS 1 "bz2" or "lz4".
     """
     ros1 = form == "bag"
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
@@ -169,7 +169,7 @@ def _message(store, kind, value, stamp, frame, ros1):
 
 
 def _quaternion(pose):
-    """Return w x y z, of either sign: a recorder need not choose."""
+    """Return w x y z, with either sign, as a recorder may."""
     from surgicai_vision.scene.rotations import matrix_to_quaternion
 
     quaternion = matrix_to_quaternion(pose[:3, :3])

@@ -1,6 +1,6 @@
 """A headless Chromium that tests steer through its debugging pipe.
 
-Nothing but the standard library.
+It needs only the standard library.
 """
 
 import json
@@ -28,7 +28,7 @@ class Browser:
             f"--user-data-dir={profile}",
         ]
         options += [f"--window-size={width},{height}", "--no-first-run", "about:blank"]
-        # the browser reads there and writes here
+        # the browser reads from the first and writes to the second
         shell = f'exec "$0" "$@" 3<&{to_browser[0]} 4>&{from_browser[1]}'
         self._process = subprocess.Popen(
             ["bash", "-c", shell, CHROMIUM, *options],
@@ -70,7 +70,7 @@ class Browser:
         )
 
     def value(self, expression):
-        """Return what an expression of the page is."""
+        """Return the value of an expression in the page."""
         answer = self.call(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
         )
@@ -78,14 +78,14 @@ class Browser:
         return answer["result"].get("value")
 
     def until(self, expression, seconds=20):
-        """Wait until an expression is true; its last value."""
+        """Wait until an expression is true; return its last value."""
         end = time.monotonic() + seconds
         while not (value := self.value(expression)) and time.monotonic() < end:
             time.sleep(0.02)
         return value
 
     def call(self, method, **parameters):
-        """Return a method's result; complaints of the page are collected on the way."""
+        """Return a method's result; collect the page's complaints meanwhile."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         if self._session:

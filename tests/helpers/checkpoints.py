@@ -1,4 +1,4 @@
-"""Untrained checkpoints on disk, for the tests of what reads them."""
+"""Untrained checkpoints on disk, for tests of code that reads them."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
-"""A needle that no arm holds: a hand that cannot be seen drives it along a given path.
+"""A needle that no arm holds: an invisible hand drives it along a given path.
 
-So tissue can be tested where no arm can bring the needle: through every pair of holes of every
+It tests tissue where no arm can bring the needle: through every pair of holes of every
 layout, in both directions.
 """
 
@@ -21,13 +21,13 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion
 STILL = [0.0] * 7
 STEP = StepSize.of("paper")
 TURN = math.radians(2.0)
-"""Of the needle per control step: 0.36 mm, about what the expert drives."""
+"""Turn of the needle per control step [rad]: 0.36 mm, about as fast as the expert."""
 OUTSIDE = math.radians(20.0)
-"""How far before the skin the tip starts."""
+"""Angle before the skin at which the tip starts [rad]."""
 
 
 def driven(scene: SceneConfig, draws: tuple[float, ...] | None = None) -> Simulation:
-    """Return a simulation whose needle hangs on a hand, in soft tissue, randomised by `draws`."""
+    """Return a simulation of soft tissue with the needle on a hand, randomised by `draws`."""
     spec = build_spec(scene)
     spec.worldbody.add_body(name="hand", mocap=True)
     weld = spec.add_equality(
@@ -52,7 +52,7 @@ def put(simulation: Simulation, pose: np.ndarray) -> None:
 
 
 def carry(simulation: Simulation, pose: np.ndarray) -> None:
-    """Take hand and needle to T_world_needle, (4, 4), in no time; the tissue keeps its wounds."""
+    """Move hand and needle to T_world_needle, (4, 4), at once; the tissue keeps its wounds."""
     free = simulation.scene.needle_qpos
     simulation.data.qpos[free] = [*pose[:3, 3], *matrix_to_quaternion(pose[:3, :3])]
     simulation.data.qvel[:] = 0.0
@@ -81,7 +81,7 @@ class Circle:
         self.between = 2 * math.asin(half / radius)
 
     def pose(self, angle_at_entry: float) -> np.ndarray:
-        """Return T_world_needle with the needle's point at that angle [rad] in the entry."""
+        """Return T_world_needle with the needle's point at that angle [rad] at the entry."""
         tangent = np.cross(self.radial, self.axis)
         x = -math.cos(angle_at_entry) * self.radial + math.sin(angle_at_entry) * tangent
         pose = np.eye(4)
@@ -94,10 +94,10 @@ def drive(simulation: Simulation, circle: Circle, first: float, last: float, eac
     """Drive the needle from the angle `first` at the entry to `last` [rad].
 
     Args:
-        simulation: of `driven`.
-        circle: where to.
-        first: where it is now.
-        last: where it ends.
+        simulation: from `driven`.
+        circle: path of the needle.
+        first: present angle.
+        last: final angle.
         each: called after each control step.
     """
     steps = max(1, round(abs(last - first) / TURN))

@@ -35,7 +35,7 @@ def actions(count, seed=0):
 
 
 def play(env, steps):
-    """Let the expert take `steps` control steps; return what was seen and done."""
+    """Let the expert take `steps` control steps; return the observations and actions."""
     expert, seen, done = Expert(env), [], []
     for _ in range(steps):
         done.append(expert.action())

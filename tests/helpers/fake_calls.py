@@ -37,7 +37,7 @@ def tell_environment(connection):
 
 
 def have_children(connection):
-    """Start a child and a program, and tell their process ids."""
+    """Start a child and a program, and send their process ids."""
     child = Child(wait)
     module = start_module("fake_calls", "60")
     connection.send([os.getpid(), child.connection.recv(), module.pid])
@@ -50,7 +50,7 @@ def wait(connection):
 
 
 def stay(connection):
-    """Wait for something else than the end of the pipe."""
+    """Wait without noticing the end of the pipe."""
     time.sleep(60)
 
 

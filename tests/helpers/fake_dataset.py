@@ -14,7 +14,7 @@ DIM = 12
 
 
 class FakeData:
-    """What the stand-ins for a dataset share; each adds what its test reads."""
+    """Base of the stand-ins for a dataset; each adds what its test reads."""
 
     fps = names.FPS
     path = Path("fake")
@@ -62,14 +62,14 @@ class FakeDataset(FakeData):
 
 
 def recorded(episodes: int = 5, steps: int = 40) -> FakeDataset:
-    """Return a dataset that tells the time of its frames."""
+    """Return a dataset with the time of its frames."""
     dataset = FakeDataset(episodes, steps)
     dataset._columns["timestamp"] = np.tile(np.arange(steps) / names.FPS, episodes)
     return dataset
 
 
 def fake_procedures(episodes: int = 6, steps: int = 40) -> FakeDataset:
-    """Return whole procedures whose arms tell the phase and the time since it began."""
+    """Return whole procedures whose arm poses encode the phase and the time since it began."""
     dataset = FakeDataset(episodes, 5 * steps, TaskConfig(names.SUTURE), names.SUTURE)
     phase = np.tile(np.repeat(np.arange(5), steps), episodes)
     since = np.tile(np.arange(steps), 5 * episodes)

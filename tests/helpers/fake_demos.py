@@ -14,7 +14,7 @@ def render_with_fake_env(monkeypatch, config):
 
 
 def write_demos(folder, config, seeds):
-    """Write one demonstration a seed into `folder` and return it."""
+    """Write one demonstration per seed into `folder` and return the folder."""
     env = FakeEnv(config)
     folder.mkdir()
     for index, seed in enumerate(seeds):

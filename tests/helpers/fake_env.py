@@ -13,7 +13,7 @@ from surgicai_vision.demos.demonstrator import Demonstrator
 
 
 class FakeCalibration:
-    """What the fake knows of its cameras: a window that moves with the position."""
+    """The fake's camera calibration: a window that moves with the position."""
 
     def __init__(self, env):
         self._env = env
@@ -110,7 +110,7 @@ class FakeExpert(Demonstrator):
         self.env = env
 
     def action(self):
-        # A start beyond 0.55 is one this expert never reaches.
+        # This expert never reaches a goal beyond 0.55.
         goal, position = self.env.state[:2]
         speed = 0.0 if goal > 0.55 else np.clip((goal - position) / 0.1, -1, 1)
         return np.array([speed, 0, 0, 0, 0, 0, 1], np.float32)

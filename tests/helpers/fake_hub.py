@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 
 class FakeHub:
-    """Keeps commits in a folder and notes what it is asked."""
+    """Keeps commits in a folder and records its calls."""
 
     def __init__(self, folder: Path, fail: Exception | None = None):
         self.folder, self.fail, self.asked, self.tags = folder, fail, [], {}

@@ -25,7 +25,7 @@ class Run:
 
 
 def good_streams():
-    """Return what a good little bag holds."""
+    """Return the streams of a small valid bag."""
     times, found = np.arange(20) * 20_000_000, np.tile(np.eye(4), (20, 1, 1))
     return {"psm1_pose": (times, found), "needle": (times, found), "label": (times, ["grasp"] * 20)}
 
@@ -68,7 +68,7 @@ def ros1_bomb(path):
 
 
 def evil_definitions(trace):
-    """Return texts that a reader which makes code of them would run."""
+    """Return bad definitions; a reader that compiles them would run some."""
     call = f"__import__('os').system('touch {trace}')"
     return {
         "call as a type": f"{call} x",
@@ -165,7 +165,7 @@ def mcaps(folder):
 
 
 def databases(folder, trace):
-    """Write folders of ROS 2 with what a database and its description may hold."""
+    """Write ROS 2 folders with unusual or malicious databases and descriptions."""
     folder.mkdir()
     good = write_bag(folder / "good", "db3", good_streams())
     changes = {

@@ -7,11 +7,11 @@ from surgicai_vision.robot.transport import Received
 
 
 class Medium:
-    """What several transports of one process share."""
+    """The state that several transports of one process share."""
 
     def __init__(self):
         self.inboxes = defaultdict(list)
-        self.kept = {}  # what those who come later hear too
+        self.kept = {}  # messages that later subscribers receive too
         self.count = 0
 
 

@@ -1,4 +1,4 @@
-"""The naive crossing of a needle's polyline with a hole, to compare the closed form with."""
+"""A naive test whether a needle's polyline crosses a hole, as a reference for the closed form."""
 
 import numpy as np
 

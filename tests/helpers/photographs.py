@@ -16,7 +16,7 @@ def hopper() -> np.ndarray:
 
 
 def photograph(name: str) -> np.ndarray:
-    """A photograph of tests/images, (1, 224, 224, 3) uint8 RGB."""
+    """A photograph of tests/helpers/images, (1, 224, 224, 3) uint8 RGB."""
     import cv2
 
     image = cv2.imread(str(Path(__file__).parent / "images" / f"{name}.jpg"))

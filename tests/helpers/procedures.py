@@ -1,4 +1,4 @@
-"""A whole procedure by the expert, step by step, for tests that play it again."""
+"""A whole procedure by the expert, step by step, for tests that replay it."""
 
 import functools
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class Procedure:
 
 @functools.cache
 def expert_procedure(seed: int) -> Procedure:
-    """Return the expert's procedure from a start; the env goes on by the measured success."""
+    """Return the expert's procedure from a start; the env advances by measured success."""
     env = envs.make(TaskConfig("suture"))
     env.reset(seed=seed)
     expert = Expert(env)

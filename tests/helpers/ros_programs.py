@@ -1,4 +1,4 @@
-"""Programs that run with a real ROS, in a Python that imports it, beside the test."""
+"""Programs that run with a real ROS, in a Python that imports it, alongside the test."""
 
 import contextlib
 import os
@@ -11,9 +11,9 @@ ROOT = Path(__file__).resolve().parents[2]
 ROSPY_PATH = os.environ.get("SURGICAI_ROSPY_PATH", "/usr/lib/python3/dist-packages")
 """Folder of rospy's packages (Debian: python3-rospy, python3-rosmaster, python3-sensor-msgs)."""
 RCLPY_PYTHON = os.environ.get("SURGICAI_RCLPY_PYTHON", sys.executable)
-"""A Python that imports rclpy; of this Python's version where it is to import us too."""
+"""A Python that imports rclpy; it needs this Python's version to import us too."""
 APPENDED = "import sys; sys.path += {paths!r}\n"
-"""What makes a Python find packages after its own."""
+"""Code that lets a Python find packages after its own."""
 MASTER = """
 import os, time
 from rosmaster.master import Master
@@ -25,7 +25,7 @@ while True:
 """
 COMMAND = "from surgicai_vision.commands.main import main\nsys.exit(main())\n"
 CRTK = ("OperatingState", "StringStamped")
-"""Messages of crtk_msgs, of which there are no wheels; `scripts/crtk_msgs.py` builds them."""
+"""Messages of crtk_msgs, which has no wheels; `scripts/crtk_msgs.py` builds them."""
 STAND_IN = """
 import types
 from std_msgs.msg import String
@@ -116,14 +116,14 @@ def ros_command(kind, code, *arguments):
 
 
 def run_ros(kind, code, *arguments, timeout=120):
-    """Run code to its end."""
+    """Run code to completion."""
     command, env = ros_command(kind, code, *arguments)
     return subprocess.run(command, env=env, capture_output=True, text=True, timeout=timeout)
 
 
 @contextlib.contextmanager
 def running(kind, code, *arguments, until):
-    """Run code beside the test once its output has a line with `until`."""
+    """Run code alongside the test, after waiting for an output line with `until`."""
     command, env = ros_command(kind, code, *arguments)
     process = subprocess.Popen(
         command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

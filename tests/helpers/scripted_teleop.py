@@ -8,7 +8,7 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 @TeleoperatorConfig.register_subclass("scripted")
 @dataclass(kw_only=True)
 class ScriptedConfig(TeleoperatorConfig):
-    """The actions' names, and the file of their values, a row each; the last one stays."""
+    """The actions' names, and their values, one row per action; the last row repeats."""
 
     names: list[str] = field(default_factory=list)
     rows: list[list[float]] = field(default_factory=list)

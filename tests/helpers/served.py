@@ -1,4 +1,4 @@
-"""Serves a simulation in a process of its own, as a person would."""
+"""Serves a simulation in a separate process, as a person would."""
 
 import contextlib
 import os
@@ -6,12 +6,12 @@ import subprocess
 import sys
 
 DOMAIN = 1 + os.getpid() % 200
-"""A domain of this process's own, so that tests beside each other do not meet."""
+"""A domain for this process alone, so that parallel tests do not interfere."""
 
 
 @contextlib.contextmanager
 def serving(*options, domain=DOMAIN):
-    """Run `robot serve` with the options; yields the process."""
+    """Run `robot serve` with the options; yield the process."""
     command = [sys.executable, "-m", "surgicai_vision", "robot", "serve", *options]
     process = subprocess.Popen(
         [*command, "--domain", str(domain)],

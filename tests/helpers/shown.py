@@ -1,10 +1,10 @@
-"""Progress for tests: a stage that hands what it is told to a function."""
+"""Progress for tests: a stage that passes its reports to a function."""
 
 from contextlib import contextmanager
 
 
 def showing(progress):
-    """Return a stage whose every display is the function `progress`."""
+    """Return a stage that reports to the function `progress`."""
 
     @contextmanager
     def stage(title, unit=""):

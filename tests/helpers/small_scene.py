@@ -9,7 +9,7 @@ SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 
 
 def small_spec() -> mujoco.MjSpec:
-    """Return a wall 123.4 mm before the camera "front", a needle ball, and an arm of bodies."""
+    """Return a wall 123.4 mm in front of the camera "front", a ball as needle, and two arms."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.stat.extent, spec.stat.center = 0.1, [0.0, 0.0, 0.0]

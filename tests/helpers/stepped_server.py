@@ -1,4 +1,4 @@
-"""A served simulation in this process, stepped by whoever waits for it."""
+"""A simulation served in this process; it steps whenever the client waits."""
 
 import functools
 
@@ -19,7 +19,7 @@ def env_of(task, advance=ADVANCES[0]):
 
 
 class Served(MemoryTransport):
-    """A transport at whose other end a stepped server is asked whenever the client waits."""
+    """A transport to a stepped server that is polled whenever the client waits."""
 
     def __init__(self, task, views=(), recordings=None, tell=None, size=64, advance=ADVANCES[0]):
         super().__init__()

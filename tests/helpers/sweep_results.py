@@ -1,6 +1,6 @@
 """A sweep's folder as sweeps leave it, with generated episodes.
 
-Every kind of thing a report has to show.
+It has everything that a report can show.
 """
 
 import itertools
@@ -98,18 +98,18 @@ STAGE_ERRORS = StageErrors(
     calibration_error=0.0123,
     progress_error=0.0456,
 )
-"""Of the high-level policy of the whole procedure."""
+"""Errors of the high-level policy of the whole procedure."""
 
 
 def run_of(task, encoder, views, seed, **more):
-    """A run of 50 demonstrations."""
+    """A run with 50 demonstrations."""
     return RunConfig(
         TaskConfig(task), encoder, tuple(views), seed=seed, **{"demonstrations": 50, **more}
     )
 
 
 def store_run(out, key, run, rate, generator):
-    """Store a run that was done."""
+    """Store a finished run."""
     folder = out / "runs" / key
     about = {"checkpoint": CHECKPOINT, "folder": f"outputs/sweeps/table/runs/{key}/policy"}
     summary = evaluation(folder / "evaluation", run, rate, generator, about)

@@ -1,4 +1,4 @@
-"""Scripted operators: they read the env and press what a person would, by keyboard or gamepad."""
+"""Scripted operators: they read the env and use keyboard or gamepad as a person would."""
 
 import numpy as np
 from fake_env import FakeEnv
@@ -14,7 +14,7 @@ REST = Input()
 SHORT = TaskConfig("grasp", max_steps=12)
 VIEWS = ("front", "back")
 FAST = 0.6
-"""A motion above this share of full speed is worth a full press; below it a fine one."""
+"""A motion above this share of full speed gets a full press, one below it a fine press."""
 
 
 def event(name):
@@ -33,7 +33,7 @@ def expert_motion(env, mapping, view):
 
 
 class GamepadOperator:
-    """Moves sticks, triggers and bumpers of a gamepad, in their steps of 1/127."""
+    """Moves a gamepad's sticks, triggers and bumpers, in steps of 1/127."""
 
     def __init__(self, session, mapping):
         self.session, self.mapping = session, mapping
@@ -54,13 +54,13 @@ class GamepadOperator:
 
 
 def deflection(speed):
-    """Return the deflection, in steps of 1/127, that the gamepad's curve makes `speed` of."""
+    """Return the deflection, in steps of 1/127, that the gamepad's curve turns into `speed`."""
     value = np.sign(speed) * (DEAD_ZONE + (1 - DEAD_ZONE) * np.sqrt(min(abs(speed), 1.0)))
     return float(np.round(value * 127) / 127) if abs(speed) > 1e-3 else 0.0
 
 
 class KeyboardOperator:
-    """Presses keys; the error of one press is made up for by the next ones."""
+    """Presses keys; later presses correct the error of earlier ones."""
 
     def __init__(self, session, mapping):
         self.session, self.mapping = session, mapping
@@ -87,7 +87,7 @@ class KeyboardOperator:
 
 
 class Script:
-    """Plays one input a tick, then none."""
+    """Plays one input per tick, then none."""
 
     def __init__(self, *inputs):
         self.inputs = list(inputs)
@@ -109,7 +109,7 @@ class FakeMapping:
 
 
 class SessionEnv(FakeEnv):
-    """The stand-in env with what a session needs besides."""
+    """The stand-in env with what else a session needs."""
 
     class subtask:
         name = "grasp"

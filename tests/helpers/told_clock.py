@@ -1,8 +1,8 @@
-"""A clock for tests: time passes when told."""
+"""A clock for tests: it advances only on command."""
 
 
 class Clock:
-    """Time that passes when told."""
+    """A clock that advances only on command."""
 
     def __init__(self):
         self.now = 0.0

@@ -1,4 +1,4 @@
-"""A served simulation in real time, on a clock of the test's: whoever waits lets it go on."""
+"""A simulation served in virtual real time: the test's clock advances whenever someone waits."""
 
 from types import SimpleNamespace
 
@@ -11,16 +11,16 @@ from surgicai_vision.robot.simulated import SimulatedRobot
 MODULES = ("server", "client", "driver")
 """Modules of `surgicai_vision.robot` that read a clock."""
 BEGINS = 100.0
-"""What the clock says first [s]."""
+"""First reading of the clock [s]."""
 
 
 class VirtualTime(MemoryTransport):
-    """A transport at whose other end a server runs in virtual real time.
+    """A transport to a server that runs in virtual real time.
 
     Args:
-        monkeypatch: puts the clock in the place of `time`.
-        task: what is served.
-        phase: when the server's control steps begin, after the client's first moment [s].
+        monkeypatch: replaces `time` by the clock.
+        task: task of the served env.
+        phase: delay of the server's first control step after the client's first moment [s].
     """
 
     def __init__(self, monkeypatch, task, phase=0.0):
@@ -43,11 +43,11 @@ class VirtualTime(MemoryTransport):
         self._halfway = {}
 
     def wait(self, seconds):
-        """Let a little time pass, as a message would come."""
+        """Let a little time pass, as if a message came."""
         self.pass_time(min(seconds, 0.001))
 
     def pass_time(self, seconds):
-        """Let time pass, and the server do what falls into it."""
+        """Let time pass, and let the server do what is due."""
         ends = self.now + seconds
         while (due := self.begun + self.halves * CONTROL_S / 2) <= ends:
             self.now = due

@@ -1,4 +1,4 @@
-"""The distribution: what it owns, what its lock promises, what no file may name, doctor."""
+"""The distribution: the names it owns, its lock, hosts that no file may name, doctor."""
 
 import importlib.metadata
 import os
@@ -24,7 +24,7 @@ REGISTRY_HOSTS = (
 
 @pytest.fixture(scope="module")
 def tracked(root: Path) -> list[Path]:
-    """Every file git holds or would hold."""
+    """Every file that git tracks or would track."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     if not (root / ".git").exists():
         pytest.skip("not a git checkout")
@@ -112,7 +112,7 @@ def test_uv_lock_and_outputs_stay_out_of_git(tracked: list[Path], root: Path) ->
 
 
 def test_setup_refuses_a_python_that_exists_and_fails(root: Path, tmp_path: Path) -> None:
-    """A pyenv shim stands in PATH under the right name and fails when it is run."""
+    """A pyenv shim is in PATH under the right name and fails when it is run."""
     shim = tmp_path / "python3.12"
     shim.write_text("#!/bin/sh\nexit 127\n")
     shim.chmod(0o755)

@@ -1,4 +1,4 @@
-"""Documentation: what it names exists: verbs, options, files, modules; its tables are whole."""
+"""Documentation: the verbs, options, files and modules it names exist; its tables are intact."""
 
 import contextlib
 import functools
@@ -51,7 +51,7 @@ def help_of(verb: str) -> str:
 
 
 def commands(page: Path) -> list[list[str]]:
-    """The words of every command line of ours in a page, continued lines joined."""
+    """The words of each of our command lines in a page, with continued lines joined."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     return [shlex.split(found) for found in COMMAND.findall(text)]
 
@@ -102,7 +102,7 @@ def test_modules_named_in_docs_exist(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_row_of_a_table_has_as_many_cells_as_its_head(page: Path) -> None:
-    """A row that was wrapped, or joined to another, is shown as prose full of bars."""
+    """A row that was wrapped, or joined to another, is shown as text full of bars."""
     lines = page.read_text(encoding="utf-8").splitlines()
     broken = [line for line in lines if "|---" in line and not RULE.fullmatch(line.strip())]
     for index, line in enumerate(lines):
@@ -115,7 +115,7 @@ def test_every_row_of_a_table_has_as_many_cells_as_its_head(page: Path) -> None:
 
 
 def _cells(row: str) -> int:
-    """How many cells a table's row has; 0 where it is none."""
+    """The number of cells in a table's row; 0 if it is not a row."""
     text = row.strip()
     whole = text.startswith("|") and text.endswith("|")
     return len(re.findall(r"(?<!\\)\|", text)) - 1 if whole else 0

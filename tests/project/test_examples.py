@@ -1,4 +1,4 @@
-"""Examples: each script and notebook runs as it stands, in small settings, and is short."""
+"""Examples: each script and notebook runs as it stands, in small settings; scripts are short."""
 
 import runpy
 import sys
@@ -15,7 +15,7 @@ from surgicai_vision.features.encoders import ENCODERS
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 LINES = 60
-"""As long as a script may be."""
+"""Most lines that a script may have."""
 HERE = ["--workers", "0"]
 """Work in this process: starting another takes longer than the work."""
 SMALL = {

@@ -7,6 +7,6 @@ TESTS = Path(__file__).resolve().parents[1]
 
 
 def test_no_two_test_files_share_a_name() -> None:
-    """Two of one name pass when run apart, and end a run of all tests by an error."""
+    """Two files of the same name pass when run separately, but abort a run of all tests."""
     names = Counter(path.name for path in TESTS.rglob("test_*.py"))
     assert [name for name, times in names.items() if times > 1] == []

@@ -9,7 +9,7 @@ import pytest
 from surgicai_vision.commands.main import main
 
 SMALL = {
-    "learning_starts=1_000": "learning_starts=201",  # HER begins after a whole episode
+    "learning_starts=1_000": "learning_starts=201",  # HER starts after a whole episode
     "buffer_size=20_000": "buffer_size=300",
     "learn(100_000)": "learn(202)",
     "image_size=84": "image_size=36",
@@ -17,7 +17,7 @@ SMALL = {
     "n_envs=8": "n_envs=2",
     "--episodes 50": "--episodes 1 --workers 1",
 }
-"""What stands on the page → what makes it small."""
+"""Text on the page → its replacement for a small run."""
 
 
 def test_stable_baselines_learns_and_is_evaluated(

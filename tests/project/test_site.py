@@ -1,4 +1,4 @@
-"""The documentation's site builds without a warning, and a browser shows it without an error."""
+"""The documentation site builds without a warning, and a browser shows it without an error."""
 
 import functools
 import importlib.util
@@ -27,7 +27,7 @@ PAGES = (
 )
 """One page of each kind."""
 WIDTHS = (1280, 420)
-"""A desk's and a phone's [CSS px]."""
+"""Of a desktop's and a phone's window [CSS px]."""
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +87,10 @@ def address(site: Path) -> Iterator[str]:
 
 
 class Silent(SimpleHTTPRequestHandler):
-    """Serves files and says nothing."""
+    """Serves files without logging."""
 
     def log_message(self, format: str, *arguments: object) -> None:
-        """Print no line a request."""
+        """Print nothing per request."""
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium here: apt-get install chromium")

@@ -1,4 +1,4 @@
-"""The distribution of examples/third_party, built, installed beside ours and used by its names."""
+"""The distribution in examples/third_party: built, installed next to ours, used by its names."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def site(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(site: Path, tmp_path: Path) -> Run:
-    """The Python of a process that has the example installed."""
+    """A function that runs Python with the example installed."""
 
     def run(*arguments: str, more: Path | None = None) -> subprocess.CompletedProcess[str]:
         path = os.pathsep.join(str(folder) for folder in (site, more) if folder)

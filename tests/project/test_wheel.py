@@ -1,6 +1,6 @@
 """Wheel and sdist.
 
-Built, the wheel installed where nothing else of ours is, and used from another folder.
+Both are built; the wheel is installed without our other files and used from another folder.
 """
 
 import os
@@ -33,7 +33,7 @@ assert importlib.metadata.version("surgicai-vision") == surgicai_vision.__versio
 
 @pytest.fixture(scope="module")
 def built(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Wheel and sdist, the wheel made from the sdist, so that both are complete."""
+    """Wheel and sdist; the wheel is made from the sdist, so that both are complete."""
     out = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(root)]
     result = subprocess.run(command, capture_output=True, text=True)
@@ -90,10 +90,10 @@ def test_sdist_ships_neither_data_nor_tests(built: tuple[Path, Path]) -> None:
 def installed(
     built: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, dict[str, str]]:
-    """An empty environment with the wheel in it, and variables that lend it the dependencies.
+    """An environment with only the wheel, and variables that lend it the dependencies.
 
-    PYTHONPATH lends only what lies in this environment's site-packages; its .pth files, and with
-    them our editable install, are not read from there.
+    PYTHONPATH lends only the contents of this environment's site-packages; its .pth files, and
+    so our editable install, are not read from there.
     """
     folder = tmp_path_factory.mktemp("environment")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)

@@ -1,4 +1,4 @@
-"""The leaderboard: a row is taken only where its digest, its starts and its scene check out."""
+"""The leaderboard: a row is taken only if its digest, its starts and its scene check out."""
 
 import json
 import os
@@ -136,7 +136,7 @@ def test_the_page_pairs_rows_and_escapes_what_it_is_given(row: Row, tmp_path: Pa
     text = board.page.read_text(encoding="utf-8")
     assert "Ours &lt;b&gt;" in text and "Ours <b>" not in text
     assert text.index("Better") < text.index("Ours &lt;b&gt;"), "the best stands first"
-    assert "75/100" in text and "6e-08" in text  # 2 · 0.5^25: 25 starts that one alone solves
+    assert "75/100" in text and "6e-08" in text  # 2 · 0.5^25: 25 starts that only one solves
     again = write_leaderboard(tmp_path, tmp_path / "page.html")
     assert again.page.read_text(encoding="utf-8") == text
 

@@ -1,4 +1,4 @@
-"""Algorithms in the report: rliable's aggregates, the table beside the paper's, learning curves."""
+"""Algorithms in the report: rliable's aggregates, a table next to the paper's, learning curves."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""The report: every number and image is there, and the page stands alone."""
+"""The report: every number and image is there, and the page is self-contained."""
 
 import contextlib
 import json
@@ -113,12 +113,12 @@ def painted_stage(config, size, quality="high"):
 
 @pytest.fixture
 def painted(monkeypatch):
-    """These tests are about the page: they paint."""
+    """Paint instead of rendering: these tests are about the page."""
     monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
 
 
 class Page(HTMLParser):
-    """Counts tags, collects addresses, and knows whether every tag was closed."""
+    """Counts tags, collects addresses, and checks that every tag is closed."""
 
     VOID = ("meta", "link", "img", "br", "input")
 
@@ -141,7 +141,7 @@ class Page(HTMLParser):
 
 
 def assert_stands_alone(text):
-    """Nothing is loaded from elsewhere, tags are closed, links have their targets."""
+    """Check that nothing is loaded from elsewhere, tags are closed, links have targets."""
     page = Page(text)
     assert page.open == []
     inside = {address[1:] for address in page.addresses if address.startswith("#")}
@@ -260,7 +260,7 @@ def test_a_broken_off_evaluation_is_no_result(results, painted):
 
 
 def test_a_damaged_neighbour_is_a_bad_file(results, tmp_path):
-    """Each is refused by name; a traceback would be of another type."""
+    """Each is refused by name; a crash would raise another type."""
     marker = next(results.rglob("evaluation.json"))
     run = {"format": FORMAT}
     about = {**files.read_json(marker)["about"]}

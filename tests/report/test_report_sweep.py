@@ -1,6 +1,6 @@
 """The report of a sweep.
 
-Nothing is silently absent, numbers agree with the rows, and the page works in a browser.
+Nothing is silently absent, numbers agree with the rows, and the page is self-contained.
 """
 
 import csv
@@ -92,7 +92,7 @@ def find(groups, **wanted):
 
 
 def rows_of(text, table):
-    """The rows of one table of the page, each as its cells' texts."""
+    """The rows of one table of the page, each as the texts of its cells."""
     body = text.split(f'id="{table}"')[1].split("<tbody>")[1].split("</tbody>")[0]
     return [
         [re.sub(r"<[^>]+>", " ", c).strip() for c in row.split("</td>")[:-1]]
@@ -118,7 +118,7 @@ def test_the_papers_numbers_are_the_printed_ones(shared):
         "place",
         "handoff",
         "pullout",
-    ):  # why intervals of the paper are those of 60 episodes
+    ):  # hence the paper's intervals are those of 60 episodes
         rates = [
             paper.rate(task, encoder, view) for encoder in paper.ENCODERS for view in paper.VIEWS
         ]
@@ -273,7 +273,7 @@ def test_a_folder_where_every_cell_failed_has_a_report(tmp_path, monkeypatch):
 
 
 def test_a_cell_and_its_record_have_the_same_condition(tmp_path):
-    """A failed seed and a done one must fall into one group, whatever the cell's variant."""
+    """A failed seed and a finished one must fall into one group, whatever the cell's variant."""
     described = run_of(
         "grasp", "random", ("front",), 1, policy="act", changes=("clock=true",), demonstrations=30
     )

@@ -1,4 +1,4 @@
-"""docs/rl.md: its Python code runs, in small."""
+"""docs/rl.md: its Python code runs, in small settings."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,7 @@ SMALL = {
     "buffer_size=100_000": "buffer_size=1_000",
     "learn(50_000)": "learn(5)",
 }
-"""What stands on the page → what makes it small."""
+"""Text on the page → its replacement for a small run."""
 
 
 def test_the_code_for_ones_own_library_runs(root: Path, demos: dict[str, Path]) -> None:

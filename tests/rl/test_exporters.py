@@ -28,7 +28,7 @@ def assert_same(one, other):
 
 @pytest.mark.parametrize("obs_type", ["goal", "state"])
 def test_minari_recovers_the_env_and_its_episodes(demos, tmp_path, monkeypatch, obs_type):
-    """From the seeds the recovered env starts where the episodes do, and gives what they hold."""
+    """From its seed, the recovered env reproduces each episode's observations and rewards."""
     monkeypatch.setitem(os.environ, "MINARI_DATASETS_PATH", "")
     config = TaskConfig("grasp", reward="dense", max_steps=300)
     found = of_demos(list_demos(demos["grasp"]), config, obs_type)

@@ -1,4 +1,4 @@
-"""PPO over low-level policies: the env is the hierarchical policy's, the checkpoint its HLP."""
+"""PPO over low-level policies: its env is the hierarchical policy's, its checkpoint is an HLP."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What the libraries lack, against the papers' formulas."""
+"""What the libraries lack, checked against the papers' formulas."""
 
 import pickle
 
@@ -70,7 +70,7 @@ def _td3(**options):
 
 @pytest.mark.parametrize("normalise", [False, True])
 def test_the_actor_climbs_the_papers_gradient(normalise):
-    """λ1 ∇J - λ2 ∇L_BC, by automatic differentiation of each term by itself."""
+    """It is λ1 ∇J - λ2 ∇L_BC, with each term differentiated automatically on its own."""
     model = _td3(bc_weight=0.3, normalise_q=normalise)
     generator = torch.Generator().manual_seed(1)
     seen = torch.randn((10, 24), generator=generator)
@@ -92,7 +92,7 @@ def test_the_actor_climbs_the_papers_gradient(normalise):
 
 
 def test_without_clipping_and_cloning_its_updates_are_those_of_td3(demos):
-    """λ2 → 0, no demonstrations: the library's own TD3, step by step."""
+    """With λ2 → 0 and no demonstrations it is the library's own TD3, step by step."""
     rng = np.random.default_rng(0)
     options = {"seed": 0, "buffer_size": 64, "device": "cpu", "policy_kwargs": SMALL}
     env = envs.make(TaskConfig("grasp"), "relative")
@@ -162,7 +162,7 @@ def test_a_relabelled_success_ends_the_episode(goal_demos, task, keeps):
     asked = desired[:, DEMAND]
     if keeps:
         assert (asked == 1).all()
-        # Nothing is reached without the holes, however near the pose is.
+        # No goal is reached without the holes, however near the pose is.
         assert (achieved[batch.rewards.numpy()[:, 0] == 0][:, DEMAND] == 1).all()
     else:
         assert (asked == 0).mean() > 0.3 and reached > 0.03
@@ -233,7 +233,7 @@ def test_extractors_that_share_a_memo_compute_the_features_of_a_batch_once(goal_
         for batch, features in zip(batches[:2], expected, strict=False):
             assert torch.equal(extractor(batch), features)
     assert calls == [5, 5]
-    # A third batch drives the first out; another dict of equal numbers is another batch.
+    # A third batch evicts the first; another dict with equal numbers is another batch.
     assert torch.equal(several[0](batches[2]), expected[2])
     assert torch.equal(several[1](batches[0]), expected[0]) and calls == [5] * 4
     assert pickle.loads(pickle.dumps(memo)).find(tuple(batches[0].values())) is None
@@ -255,7 +255,7 @@ def test_the_critics_of_rlpd_have_layer_norm_and_its_actor_has_none():
     assert not any(isinstance(layer, torch.nn.LayerNorm) for layer in model.actor.modules())
     same = zip(model.critic.parameters(), model.critic_target.parameters(), strict=True)
     assert all(torch.equal(one, other) for one, other in same)
-    # LayerNorm bounds the values of actions far from all data, as the paper uses it.
+    # LayerNorm bounds the values of actions far from all data, as the paper intends.
     seen = torch.zeros((1, 24))
     values = [model.critic.q1_forward(seen, torch.full((1, 7), s)).item() for s in (1e3, 1e6)]
     assert values[0] == pytest.approx(values[1], rel=1e-2)

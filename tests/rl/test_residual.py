@@ -1,4 +1,4 @@
-"""A residual policy: the frozen policy where nothing is learned, and what is learned beside it."""
+"""A residual policy: the frozen policy where nothing is learned, and what it learns on top."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -37,7 +37,7 @@ def base(tmp_path_factory):
 
 
 def of(policy, bound=0.2):
-    """Return a residual of a loaded policy, as its training makes it."""
+    """Return a residual of a loaded policy, as training makes it."""
     values = {**policy.checkpoint.recipe, "bound": bound, "correction": (8,)}
     corrected = Residual(ResidualRecipe(**values), policy.checkpoint.visual)
     corrected.take_base(policy)

@@ -1,4 +1,4 @@
-"""Training: every algorithm leaves a checkpoint that every verb takes; a kill costs no result."""
+"""Training: every algorithm leaves a checkpoint that every verb takes; a kill changes no result."""
 
 import json
 import subprocess
@@ -36,7 +36,7 @@ def request_of(algo, demos, task="grasp", **changes):
     small = SMALL | ({"rollout": 24} if algo == "ppo" else {})
     if "learning_starts" in algorithm.settings:
         small["learning_starts"] = LIMIT + 2
-    # Demonstrations are longer than an episode of this env; they are replayed in their own limit.
+    # Demonstrations are longer than `LIMIT` allows, so their env keeps its own limit.
     env = TaskConfig(task) if algorithm.needs_demos else TaskConfig(task, max_steps=LIMIT)
     request = Request(
         algo=algo,
@@ -88,7 +88,7 @@ def test_every_algorithm_leaves_a_policy_that_acts_as_the_librarys(algo, demos, 
 
 
 def library_actions(learner, seen):
-    """What the library's own model does, greedily."""
+    """The greedy actions of the library's own model."""
     relative = np.stack([row for _, row in seen])
     if hasattr(learner, "model"):
         has_goal = learner.request.algorithm.has_hindsight
@@ -97,7 +97,7 @@ def library_actions(learner, seen):
     standard = ((relative - learner.mean.numpy()) / learner.std.numpy()).astype(np.float32)
     if learner.request.algo != "bcq":
         return learner.greedy(standard)
-    # The library draws anew each time: its own networks, with the draws that are stored.
+    # The library draws anew each time, so its networks get the stored draws.
     modules = learner._algo.impl.modules
     draws = training.actor_of(learner.request, learner).draws
     chosen = []
@@ -110,7 +110,7 @@ def library_actions(learner, seen):
 
 
 class Killed(BaseException):
-    """What ends a training in the middle."""
+    """Ends a training in the middle."""
 
 
 @pytest.mark.parametrize("algo", ["td3-her-bc", "rlpd", "ppo", "td3-her", "iql", "tqc"])
@@ -135,7 +135,7 @@ def test_a_killed_training_ends_as_if_it_had_not_been_killed(algo, demos, tmp_pa
         progress=lambda done, *_: started.append(done),
         tensorboard=False,
     )
-    assert 0 < started[0] < request.total  # it went on
+    assert 0 < started[0] < request.total  # it continued
     assert resumed.policy_sha256 == whole.policy_sha256
 
 

@@ -1,4 +1,4 @@
-"""Demonstrations as transitions: what the env gives, in every library's format."""
+"""Demonstrations as transitions: they match the env, in every library's format."""
 
 import os
 from dataclasses import replace
