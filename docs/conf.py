@@ -1,8 +1,8 @@
 """Sphinx configuration: `make docs` builds the site into build/docs from these pages.
 
-Nothing is fetched while building, and the pages load nothing from elsewhere. What would go stale
-is generated into docs/generated (`docs/site`): each verb's page from the command line, the Python
-reference from the docstrings, the examples from their files.
+Nothing is fetched during the build, and the pages load nothing from other sites. Pages that would
+go stale are generated into docs/generated (`docs/site`): each verb's page from the command line,
+the Python reference from the docstrings, the examples from their files.
 """
 
 import sys
@@ -28,13 +28,13 @@ extensions = [
 exclude_patterns = ["site", "results/*/**"]
 suppress_warnings = [
     "ref.python"
-]  # an annotation's bare name, such as Plugin, may be of two modules
+]  # an annotation's bare name, such as Plugin, may exist in two modules
 
 myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "substitution"]
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
-autodoc_mock_imports = ["genpy", "rclpy", "rosgraph", "rospy"]  # ROS itself, in no package index
+autodoc_mock_imports = ["genpy", "rclpy", "rosgraph", "rospy"]  # ROS itself, which is in no package index
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
@@ -42,7 +42,7 @@ napoleon_use_ivar = True
 python_maximum_signature_line_length = 88
 python_use_unqualified_type_names = True
 add_module_names = False
-toc_object_entries = False  # a module a line; each copy of the contents is time
+toc_object_entries = False  # one line per module; each copy of the contents costs time
 
 html_theme = "furo"
 html_title = f"surgicai-vision {__version__}"

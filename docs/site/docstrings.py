@@ -1,7 +1,7 @@
-"""Sphinx extension: the house's docstrings, made into the reStructuredText that autodoc reads.
+"""Sphinx extension: convert this project's docstrings into the reStructuredText autodoc reads.
 
 They are plain text for a terminal: an indented block is code, a list may follow a line directly, a
-star is a star, and `name` is code, here linked where it names something that has a place.
+star is a literal star, and `name` is code, here linked if the reference documents that name.
 """
 
 import itertools
@@ -12,11 +12,11 @@ from collections.abc import Iterable, Iterator
 from sphinx.application import Sphinx
 
 SECTION = re.compile(r"[A-Z][a-z]+:")
-"""The heading of a part that napoleon reads, such as `Args:`."""
+"""The heading of a section that napoleon parses, such as `Args:`."""
 BULLET = re.compile(r"\s*(\* |- |\d+\. )")
 CODE_SPAN = re.compile(r"(``.+?``|`[^`]+`)", re.DOTALL)
 SIGN = re.compile(r"[*|`\\]|(?<=\w)_(?=\W|$)", re.MULTILINE)
-"""What reStructuredText would read as markup."""
+"""Characters that reStructuredText would read as markup."""
 OURS = ("surgicai_vision.", "encoders.", "policies.")
 ARRAY = re.compile(
     r"~?(?:numpy\.)?ndarray\[~?(?:builtins\.)?tuple\[~?(?:typing\.)?(?:Any|int), \.\.\.\], "
@@ -40,7 +40,7 @@ def shorten_signature(
     arguments: str | None,
     result: str | None,
 ) -> tuple[str | None, str | None]:
-    """Return a signature in which arrays stand as they were written: NDArray[float32]."""
+    """Return a signature in which arrays appear as they were written: NDArray[float32]."""
     return tuple(text and ARRAY.sub(r"NDArray[\1]", text) for text in (arguments, result))
 
 
@@ -48,22 +48,22 @@ def rewrite_docstring(
     app: Sphinx, what: str, name: str, documented: object, options: object, lines: list[str]
 ) -> None:
     """Rewrite a docstring in place."""
-    while name not in sys.modules:  # a class or a function: the module it stands in
+    while name not in sys.modules:  # a class or a function: find its module
         name = name.rpartition(".")[0]
     lines[:] = as_rest(lines, name)
     if what in ("attribute", "data", "property"):
-        lines[:0] = ["..", ""]  # else napoleon takes what stands before a colon for the type
+        lines[:0] = ["..", ""]  # else napoleon takes the text before a colon for the type
 
 
 def as_rest(lines: Iterable[str], module: str) -> list[str]:
-    """Return a docstring with its code blocks marked, its lists apart and its signs escaped.
+    """Return a docstring with code blocks marked, lists set apart and markup characters escaped.
 
     Args:
         lines: the docstring.
-        module: where it stands; what it names of the module becomes a link.
+        module: the module it is in; names of that module become links.
     """
     result: list[str] = []
-    margin = 0  # indent of the text around
+    margin = 0  # indent of the surrounding text
     in_code = in_section = False
     for is_text, group in itertools.groupby(lines, key=lambda line: bool(line.strip())):
         paragraph = list(group)
@@ -86,18 +86,18 @@ def as_rest(lines: Iterable[str], module: str) -> list[str]:
 
 
 def indent_of(line: str) -> int:
-    """Return how many spaces a line begins with."""
+    """Return the number of spaces at the beginning of a line."""
     return len(line) - len(line.lstrip())
 
 
 def prose(paragraph: list[str], module: str) -> Iterator[str]:
-    """Yield a paragraph's lines, a blank one before a list, code spans linked, signs escaped."""
+    """Yield a paragraph's lines: lists after a blank line, code spans linked, markup escaped."""
     text = "\n".join(paragraph)
     parts = CODE_SPAN.split(text)
     for index, part in enumerate(parts):
         if index % 2:
             parts[index] = code_span(" ".join(part.strip("`").split()), module)
-        else:  # a letter right behind a span is set apart by a space that is not shown
+        else:  # an invisible space separates a span from a letter right after it
             parts[index] = ("\\ " if index and part[:1].isalnum() else "") + escape(part)
     text = "".join(parts)
     was_list = True
@@ -110,7 +110,7 @@ def prose(paragraph: list[str], module: str) -> Iterator[str]:
 
 
 def escape(text: str) -> str:
-    """Return text in which nothing but the bullets of lists is markup."""
+    """Return text in which only the bullets of lists are markup."""
     lines = []
     for line in text.split("\n"):
         bullet = BULLET.match(line)
@@ -120,7 +120,7 @@ def escape(text: str) -> str:
 
 
 def code_span(text: str, module: str) -> str:
-    """Return a code span, a link where it is a full name or the name of a thing of the module."""
+    """Return a code span, as a link if it is a full name or a name defined in the module."""
     if text.startswith(OURS) and " " not in text:
         return f":py:obj:`{text}`"
     home = getattr(getattr(sys.modules[module], text, None), "__module__", None)

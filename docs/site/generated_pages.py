@@ -1,7 +1,7 @@
-"""Sphinx extension: pages that are written anew at every build, into docs/generated.
+"""Sphinx extension: pages that every build generates again, in docs/generated.
 
-* `commands/`: one page a verb, from the command line's own parser.
-* `api/`: one page a package for autodoc, in the order of the flow.
+* `commands/`: one page per verb, from the command line's own parser.
+* `api/`: one page per package for autodoc, in the order of the flow.
 * `examples/`: each script and notebook of examples/ as a page.
 """
 
@@ -28,7 +28,7 @@ ORDER = (
     "own_encoder",
     "own_task",
 )
-"""Scripts in the order to read them; another one comes after them."""
+"""Scripts in reading order; scripts not listed here come after them."""
 INNER = (
     "surgicai_vision.scene.visual.",
     "surgicai_vision.demos.imports.",
@@ -37,7 +37,7 @@ INNER = (
     "surgicai_vision.report.",
     "surgicai_vision.experiments.sweep.",
 )
-"""What only the package itself calls: such modules have no page."""
+"""Modules that only the package itself uses; they have no section in the reference."""
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = {
     "surgicai_vision.core": "names, config, errors, files and the executor: what all stages share",
@@ -56,17 +56,17 @@ PACKAGES = {
     "surgicai_vision.report": "report: one page from stored results",
     "surgicai_vision.experiments": "whole runs: quickstart, sweep, DAgger",
 }
-"""Package → what it is, in the order of the flow."""
+"""Package → its description, in the order of the flow."""
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Have the pages written before Sphinx looks for its sources."""
+    """Write the pages before Sphinx looks for its sources."""
     app.connect("builder-inited", write_pages)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
 def write_pages(app: Sphinx) -> None:
-    """Write every generated page that differs from what is there, and remove what is no more."""
+    """Write every generated page whose content has changed, and remove stale ones."""
     folder = Path(app.srcdir) / "generated"
     pages = dict([*command_pages(), *api_pages(), *example_pages()])
     for stale in set(folder.rglob("*.*")) - {folder / name for name in pages}:
@@ -121,13 +121,13 @@ Exit codes: 0 done, 1 the work failed or was interrupted, 2 wrong input, 143 end
 
 
 def command_page(words: str, text: str, command: App, level: int) -> str:
-    """Return the page of a verb, or the section of a verb inside a verb.
+    """Return the page of a verb, or the section of a subcommand.
 
     Args:
-        words: the verb, as "dataset check".
+        words: the verb, e.g. "dataset check".
         text: what it does.
         command: its app.
-        level: of its heading.
+        level: the level of its heading.
     """
     parts = [f"{'#' * level} {words}", markdown(text)]
     inner = {name: command[name] for name in command if not name.startswith("-")}
@@ -164,7 +164,7 @@ def options_of(arguments: Iterable[Argument]) -> str:
 
 
 def option(argument: Argument) -> str:
-    """Return one option: its name and metavar; its help, choices and default."""
+    """Return one option with its name, metavar, help, choices and default."""
     flag = argument.resolved_hint is bool
     metavar = argument.parameter.metavar
     name = argument.name
@@ -189,7 +189,7 @@ def option(argument: Argument) -> str:
 
 
 def value_name(argument: Argument) -> str:
-    """Return what stands for an option's value where no metavar says it."""
+    """Return the placeholder for an option's value if it has no metavar."""
     return "CHOICE" if argument.parameter.choices else argument.name.lstrip("-").upper()
 
 
@@ -208,7 +208,7 @@ def default_of(argument: Argument) -> str:
 
 
 def markdown(text: str) -> str:
-    """Return plain text that Markdown would show as it is."""
+    """Return plain text, escaped so that Markdown shows it unchanged."""
     for sign in ("\\", "<", "*", "_", "|", "[", "]", "$"):
         text = text.replace(sign, f"\\{sign}")
     return text
@@ -242,7 +242,7 @@ most programs need.
 
 
 def package_page(package: str) -> str:
-    """Return a package's page: its own docstring, then a section a module, inner ones too."""
+    """Return a package's page: its docstring, then one section per module, nested ones too."""
     parts = [heading(package, "="), automodule(package)]
     for module in modules_of(package):
         parts += [heading(module.removeprefix(f"{package}."), "-"), automodule(module)]
@@ -250,7 +250,7 @@ def package_page(package: str) -> str:
 
 
 def short(package: str) -> str:
-    """Return how the contents call a package."""
+    """Return a package's name in the table of contents."""
     return package.removeprefix("surgicai_vision.")
 
 
@@ -314,7 +314,7 @@ Short programs against the public Python API; the tests run each of them. They s
 
 
 def place(path: Path) -> tuple[int, str]:
-    """Return where a script stands among the examples: from easy to special, then by name."""
+    """Return a script's sort key: its place in `ORDER`, or after those, then its name."""
     known = path.stem in ORDER
     return (ORDER.index(path.stem) if known else len(ORDER), path.stem)
 

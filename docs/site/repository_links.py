@@ -1,4 +1,4 @@
-"""Sphinx extension: what pages name in code spans becomes a link where the site has its page.
+"""Sphinx extension: turn a code span into a link if the site has a page for what it names.
 
 `docs/envs.md` becomes that page's title; `surgicai_vision/envs/base.py` and
 `surgicai_vision.envs.base` link to the reference, `examples/environment.py` to the example,
@@ -15,7 +15,7 @@ from surgicai_vision.commands import COMMANDS, PROGRAM
 
 
 class LinkCodeSpans(SphinxPostTransform):
-    """Replace code spans that name a page by links to it."""
+    """Replace code spans that name a page with links to it."""
 
     default_priority = 4  # before Sphinx resolves references
 
@@ -43,7 +43,7 @@ class LinkCodeSpans(SphinxPostTransform):
 
 
 def page_of(text: str, seen_from: str) -> str:
-    """Return the page that a code span on another page stands for, or nothing."""
+    """Return the page that a code span on another page refers to, "" if none."""
     if text.startswith("docs/") and text.endswith(".md"):
         return text.removeprefix("docs/").removesuffix(".md")
     if text.startswith("examples/"):

@@ -4,8 +4,8 @@
     envs = make_env("<user>/<repository>", n_envs=4, trust_remote_code=True)
     envs["handoff"][0].reset(seed=[0, 1, 2, 3])
 
-Needs `pip install surgicai-vision lerobot_env_surgicai`. This file holds no scene and no weights:
-everything it runs is in those two distributions.
+Needs `pip install surgicai-vision lerobot_env_surgicai`. This file contains no scene and no
+weights: everything it runs is in those two distributions.
 """
 
 from gymnasium.vector import VectorEnv
@@ -16,13 +16,13 @@ from lerobot_env_surgicai.environment import SUBTASKS, SurgicaiEnv
 def make_env(
     n_envs: int = 1, use_async_envs: bool = False, cfg: EnvConfig | None = None
 ) -> dict[str, dict[int, VectorEnv]]:
-    """Return {task: {0: envs side by side}}.
+    """Return {task: {0: vectorised envs}}.
 
     Args:
-        n_envs: envs of each task.
-        use_async_envs: each in a process of its own.
-        cfg: a `SurgicaiEnv`, or another configuration whose `task` names tasks between commas; all
-            five subtasks without one.
+        n_envs: envs per task.
+        use_async_envs: run each env in a separate process.
+        cfg: a `SurgicaiEnv`, or another configuration whose `task` is a comma-separated list of
+            tasks; without either, all five subtasks.
     """
     if isinstance(cfg, SurgicaiEnv):
         return cfg.create_envs(n_envs, use_async_envs)

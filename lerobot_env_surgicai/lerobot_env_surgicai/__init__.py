@@ -1,8 +1,8 @@
 """LeRobot plug-in: importing it registers the env `surgicai` and two policies.
 
-They are `surgicai_bc` and `surgicai_checkpoint`. The gymnasium ids come with them. `lerobot-train`
-and `lerobot-eval` import every distribution called `lerobot_env_…`, and so does a worker process
-that is handed an env of ours.
+The policies are `surgicai_bc` and `surgicai_checkpoint`. The gymnasium ids are registered as well.
+`lerobot-train` and `lerobot-eval` import every distribution named `lerobot_env_…`; a worker process
+that receives one of our envs imports this one.
 """
 
 from lerobot_env_surgicai.configuration_surgicai_bc import SurgicaiBcConfig

@@ -3,14 +3,14 @@
     surgicai-vision train --task handoff --policy act --encoder imagenet-lite-early --pool spatial
 
 The networks and their losses are LeRobot's own classes, unmodified: `ACTPolicy`, `DiffusionPolicy`,
-`VQBeTPolicy`. Their image backbone is what differs: a frozen encoder whose features come from the
-cache, and the trained head of `bc` where these are maps (`policies.layers`). What the head leaves
-is `observation.environment_state`; VQ-BeT, which takes images alone, is given it in the place of
-its image encoder's features. `settings` of a recipe are fields of LeRobot's configuration.
+`VQBeTPolicy`. Only the image backbone differs: a frozen encoder whose features come from the cache,
+followed by the trained head of `bc` if the features are maps (`policies.layers`). The output is
+`observation.environment_state`; VQ-BeT, which takes only images, gets it instead of its image
+encoder's features. `settings` of a recipe are fields of LeRobot's configuration.
 
-Other differences from `lerobot-train`: inputs have mean 0 and variance 1 for all three (LeRobot
-brings the state of Diffusion and VQ-BeT to [-1, 1]); actions are normalised as LeRobot does;
-padded actions are left out of Diffusion's loss (`do_mask_loss_for_padding`).
+Other differences from `lerobot-train`: inputs are normalised to mean 0 and variance 1 for all three
+(LeRobot scales the state of Diffusion and VQ-BeT to [-1, 1]); padded actions are excluded from
+Diffusion's loss (`do_mask_loss_for_padding`). Actions are normalised as in LeRobot.
 """
 
 import abc
@@ -40,11 +40,11 @@ from surgicai_vision.core.errors import InputError, check_name
 type Batch = dict[str, torch.Tensor]
 IS_PAD = "action_is_pad"
 VQ_BATCH = 256
-"""Chunks of an update of VQ-BeT's action codes (LeRobot's batch is the training's)."""
+"""Chunks per update of VQ-BeT's action codes (LeRobot uses the batch size of the training)."""
 
 
 class LeRobotChunks(ChunkPolicy, abc.ABC):
-    """Base of the three: what a batch of LeRobot's is made of."""
+    """Base of the three policies: it builds LeRobot's batches."""
 
     normalisation = "min_max"
 
@@ -61,7 +61,7 @@ class LeRobotChunks(ChunkPolicy, abc.ABC):
 
     @abc.abstractmethod
     def _batch(self, visual: torch.Tensor, vector: torch.Tensor) -> Batch:
-        """Return what LeRobot's policy sees; arguments as in `plan_normalised`."""
+        """Return the batch that LeRobot's policy sees; arguments as in `plan_normalised`."""
 
     def chunk_loss(
         self,
@@ -76,14 +76,14 @@ class LeRobotChunks(ChunkPolicy, abc.ABC):
         return loss
 
     def state_features(self) -> dict[str, PolicyFeature]:
-        """Return what LeRobot is told of the inputs: the state, and the features in its place."""
+        """Return the inputs in LeRobot's form: the state, and features as environment state."""
         return {
             OBS_STATE: PolicyFeature(FeatureType.STATE, (self.vector_dim,)),
             OBS_ENV_STATE: PolicyFeature(FeatureType.ENV, (self.seen_dim,)),
         }
 
     def shown(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-        """Return what stands for the images, (B, h, seen_dim): the vector where there are none."""
+        """Return the images' features, (B, h, seen_dim), or the vector if there are no images."""
         return visual if self.heads.dim else vector
 
 
@@ -91,7 +91,7 @@ class LeRobotChunks(ChunkPolicy, abc.ABC):
 class Act(LeRobotChunks):
     """LeRobot's Action Chunking Transformer.
 
-    Its loss is L1, and the weighted divergence of the latent in training.
+    Its loss is L1 plus, in training, the weighted KL divergence of the latent.
     """
 
     normalisation = "mean_std"
@@ -115,7 +115,7 @@ class Act(LeRobotChunks):
         return ACTPolicy(config)
 
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-        """Return the chunk of the latent's mean."""
+        """Return the chunk decoded from the mean of the latent."""
         self.network.eval()
         chunk: torch.Tensor = self.network.predict_action_chunk(self._batch(visual, vector))
         return chunk
@@ -146,7 +146,7 @@ class Diffusion(LeRobotChunks):
         return DiffusionPolicy(config)
 
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-        """Return a chunk that is denoised from random numbers."""
+        """Return a chunk denoised from random noise."""
         chunk: torch.Tensor = self.network.diffusion.generate_actions(self._batch(visual, vector))
         return chunk
 
@@ -155,7 +155,7 @@ class Diffusion(LeRobotChunks):
 
 
 class _Given(nn.Module):
-    """Stands for VQ-BeT's image encoder: the features are there already."""
+    """Replaces VQ-BeT's image encoder: the features are already computed."""
 
     def __init__(self, dim: int):
         super().__init__()
@@ -168,7 +168,7 @@ class _Given(nn.Module):
 
 @final
 class VqBet(LeRobotChunks):
-    """LeRobot's VQ-BeT: action codes first, then a transformer that names them."""
+    """LeRobot's VQ-BeT: action codes first, then a transformer that predicts them."""
 
     def build(self, recipe: ChunkRecipe) -> PreTrainedPolicy:
         """Return `VQBeTPolicy` without its image encoder."""
@@ -177,8 +177,8 @@ class VqBet(LeRobotChunks):
                 f"history is {recipe.history} with frame_stride {recipe.frame_stride}; VQ-BeT "
                 "predicts the actions of every moment it sees: take history=1 or frame_stride=1."
             )
-        dim = self.seen_dim + self.seen_dim % 2  # twice a number of key points, to LeRobot
-        side = 64  # of an image that nobody sees, though an encoder is built for it
+        dim = self.seen_dim + self.seen_dim % 2  # LeRobot needs twice a number of key points
+        side = 64  # of a nominal image: LeRobot builds an encoder for it, unused
         config = _config(
             VQBeTConfig,
             recipe,
@@ -200,8 +200,8 @@ class VqBet(LeRobotChunks):
     def measure(self, target: torch.Tensor) -> None:
         """Store the actions' statistics, then fit the action codes as LeRobot's first phase does.
 
-        LeRobot fits them by the first `n_vqvae_training_steps` updates of the training, with the
-        learning rate and the weight decay of its configuration; here they come before it.
+        LeRobot fits them in the first `n_vqvae_training_steps` updates of the training, with the
+        learning rate and the weight decay of its configuration; here this is done before training.
         """
         super().measure(target)
         head = self.network.vqbet.action_head
@@ -216,7 +216,7 @@ class VqBet(LeRobotChunks):
         codes.train()
         for _ in range(config.n_vqvae_training_steps):
             rows = torch.randint(len(actions), (min(VQ_BATCH, len(actions)),))
-            with contextlib.redirect_stdout(io.StringIO()):  # it says when it is done
+            with contextlib.redirect_stdout(io.StringIO()):  # it prints when it is done
                 loss = head.discretize(config.n_vqvae_training_steps, actions[rows])[0]
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -230,21 +230,21 @@ class VqBet(LeRobotChunks):
         actions: torch.Tensor,
         is_pad: torch.Tensor,
     ) -> torch.Tensor:
-        """Return LeRobot's loss of the second phase: of the codes and the offsets."""
+        """Return LeRobot's loss of the second phase, over the codes and the offsets."""
         batch = {**self._batch(visual, vector), ACTION: actions}
         _, losses = self.network.vqbet(batch, rollout=False)
         loss: torch.Tensor = losses["loss"]
         return loss
 
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-        """Return the chunk of codes that are drawn by their probabilities."""
+        """Return the chunk of codes sampled from their predicted probabilities."""
         chunk: torch.Tensor = self.network.vqbet(self._batch(visual, vector), rollout=True)
         return chunk
 
     def _batch(self, visual: torch.Tensor, vector: torch.Tensor) -> Batch:
         shown = self.shown(visual, vector)
         padded = nn.functional.pad(shown, (0, self._padding))
-        return {OBS_STATE: vector, OBS_IMAGES: padded[:, :, None]}  # one image a moment
+        return {OBS_STATE: vector, OBS_IMAGES: padded[:, :, None]}  # one image per moment
 
 
 def _config[Config: PreTrainedConfig](
@@ -253,8 +253,8 @@ def _config[Config: PreTrainedConfig](
     """Return LeRobot's configuration with a recipe's settings.
 
     Raises:
-        UnknownName: a setting that LeRobot's configuration does not have.
-        InputError: one that follows from the recipe, or that LeRobot refuses.
+        UnknownName: a setting is not in LeRobot's configuration.
+        InputError: a setting follows from the recipe, or LeRobot refuses it.
     """
     for name, value in recipe.settings.items():
         if name in ours:

@@ -1,4 +1,4 @@
-"""`surgicai_bc`: behaviour cloning on frozen features, as a LeRobot policy: its settings."""
+"""Settings of `surgicai_bc`: behaviour cloning on frozen features, as a LeRobot policy."""
 
 from dataclasses import dataclass, field, replace
 
@@ -21,19 +21,20 @@ class SurgicaiBcConfig(PreTrainedConfig):  # type: ignore[misc]  # mypy skips Le
     """Settings of `surgicai_bc`; the defaults are the recipe "paper" (configs/recipes/paper.yaml).
 
     Attributes:
-        encoder: frozen encoder of the images; null sees no image.
-        encoder_weights: file with its pretrained weights, where it needs one that is not found
-            by itself.
+        encoder: frozen encoder of the images; null uses no images.
+        encoder_weights: file with the encoder's pretrained weights, if it needs one that is not
+            found automatically.
         encoder_pool: "global", "spatial" or "tokens".
         encoder_sha256: hash of the encoder's weights; written in training, verified afterwards.
         encoder_identity: hash of weights, preprocessing and pool; written in training, verified
             afterwards.
-        views: cameras; empty takes all the dataset has.
+        views: cameras; empty takes all that the dataset has.
         hidden: width of each hidden layer.
         batch_norm: put BatchNorm before each hidden layer.
-        proprioception: feed the tip's pose and the jaw too.
-        learning_rate: Adam's.
-        push_to_hub: push the trained policy; off, unlike LeRobot's own policies.
+        proprioception: also use the tip's pose and the jaw as inputs.
+        learning_rate: learning rate of Adam.
+        push_to_hub: push the trained policy to the hub; off by default, unlike in LeRobot's own
+            policies.
     """
 
     encoder: str | None = "imagenet-lite"
@@ -81,7 +82,7 @@ class SurgicaiBcConfig(PreTrainedConfig):  # type: ignore[misc]  # mypy skips Le
         """Keep the inputs this policy takes and drop the rest (depth, segmentation, other views).
 
         Raises:
-            InputError: the dataset or env lacks one of them, or acts otherwise than we do.
+            InputError: the dataset or env lacks one of these inputs, or its actions are not ours.
         """
         # mypy skips its base
         given: dict[str, PolicyFeature] = self.input_features or {}  # type: ignore[has-type]
@@ -115,19 +116,19 @@ class SurgicaiBcConfig(PreTrainedConfig):  # type: ignore[misc]  # mypy skips Le
 
     @property
     def observation_delta_indices(self) -> None:
-        """Return None: the present observation alone."""
+        """Return None: the policy uses only the present observation."""
 
     @property
     def action_delta_indices(self) -> None:
-        """Return None: one action."""
+        """Return None: the policy predicts one action."""
 
     @property
     def reward_delta_indices(self) -> None:
-        """Return None: no rewards."""
+        """Return None: the policy uses no rewards."""
 
     def get_optimizer_preset(self) -> AdamConfig:
         """Return the paper's Adam, without clipping."""
         return AdamConfig(lr=self.learning_rate, grad_clip_norm=0.0)
 
     def get_scheduler_preset(self) -> None:
-        """Return None: the rate is constant."""
+        """Return None: the learning rate is constant."""

@@ -1,4 +1,4 @@
-r"""`surgicai_checkpoint`: a policy of `surgicai-vision train` in `lerobot-eval`: its settings.
+r"""Settings of `surgicai_checkpoint`: a policy of `surgicai-vision train` in `lerobot-eval`.
 
 lerobot-eval --policy.type=surgicai_checkpoint --policy.checkpoint=released:handoff \
         --env.type=surgicai --env.checkpoint=released:handoff --eval.n_episodes=20
@@ -20,9 +20,9 @@ class SurgicaiCheckpointConfig(PreTrainedConfig):  # type: ignore[misc]  # mypy 
 
     Attributes:
         checkpoint: folder of a checkpoint of `surgicai-vision train`, or released:NAME.
-        encoder_weights: file with the pretrained weights of its encoder, where it needs one that
-            is not found by itself.
-        push_to_hub: push it; off, unlike LeRobot's own policies.
+        encoder_weights: file with the pretrained weights of its encoder, if the encoder needs one
+            that is not found automatically.
+        push_to_hub: push the policy to the hub; off by default, unlike in LeRobot's own policies.
     """
 
     checkpoint: str = ""
@@ -30,7 +30,7 @@ class SurgicaiCheckpointConfig(PreTrainedConfig):  # type: ignore[misc]  # mypy 
     push_to_hub: bool = False
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
-            # The checkpoint holds the statistics of its inputs.
+            # The checkpoint itself holds the statistics of its inputs.
             "VISUAL": NormalizationMode.IDENTITY,
             "ENV": NormalizationMode.IDENTITY,
             "STATE": NormalizationMode.IDENTITY,
@@ -48,19 +48,19 @@ class SurgicaiCheckpointConfig(PreTrainedConfig):  # type: ignore[misc]  # mypy 
 
     @property
     def observation_delta_indices(self) -> None:
-        """Return None: the policy itself remembers what it saw."""
+        """Return None: the policy itself keeps past observations."""
 
     @property
     def action_delta_indices(self) -> None:
-        """Return None: one action."""
+        """Return None: the policy predicts one action."""
 
     @property
     def reward_delta_indices(self) -> None:
-        """Return None: no rewards."""
+        """Return None: the policy uses no rewards."""
 
     def get_optimizer_preset(self) -> AdamConfig:
         """Return LeRobot's default, which is never used."""
         return AdamConfig()
 
     def get_scheduler_preset(self) -> None:
-        """Return None."""
+        """Return None: the policy is not trained here."""

@@ -14,15 +14,15 @@ from surgicai_vision.core import names
 @ProcessorStepRegistry.register("surgicai_encode_views")
 @dataclass
 class EncodeViews(ObservationProcessorStep):  # type: ignore[misc]  # mypy skips LeRobot
-    """Replace the views' images by their features.
+    """Replace the views' images with their features.
 
-    They are `observation.environment_state`, (B, views × dim).
+    The features are `observation.environment_state`, (B, views × dim).
 
     Attributes:
         encoder: the encoder's name.
         views: cameras, in the order of the features.
-        weights: file with its pretrained weights.
-        sha256: hash its weights must have; empty for any.
+        weights: file with the encoder's pretrained weights.
+        sha256: hash that the weights must have; empty for any.
     """
 
     encoder: str
@@ -31,7 +31,7 @@ class EncodeViews(ObservationProcessorStep):  # type: ignore[misc]  # mypy skips
     sha256: str = ""
 
     def observation(self, observation: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Return the observation with features in place of images."""
+        """Return the observation with features instead of images."""
         encoder = load_encoder(self.encoder, self.weights, "global")
         check_identity(encoder, self.sha256, "", "The policy")
         features = torch.from_numpy(encode(encoder, observation, self.views))
@@ -53,5 +53,5 @@ class EncodeViews(ObservationProcessorStep):  # type: ignore[misc]  # mypy skips
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Return the features as they are: the env's table lists what comes out."""
+        """Return the feature table unchanged: the env's table already lists this step's output."""
         return features

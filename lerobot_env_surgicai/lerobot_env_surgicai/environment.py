@@ -2,11 +2,11 @@
 
     lerobot-eval --env.type=surgicai --env.dataset=outputs/datasets/grasp --policy.path=…
 
-What a policy sees: `observation.images.<view>` and `observation.state` as in our datasets, never
-depth (ACT and Diffusion take three channels only). With `encoder` it sees
-`observation.environment_state`, the frozen features of the views, in place of the images.
+A policy sees `observation.images.<view>` and `observation.state` as in our datasets, never depth
+(ACT and Diffusion take three channels only). With `encoder` it sees
+`observation.environment_state`, the frozen features of the views, instead of the images.
 
-All five tasks in one call, counted one by one and together:
+All five tasks in one call, with results per task and overall:
 
     lerobot-eval --env.type=surgicai --env.tasks='[grasp,place,insert,handoff,pullout]' …
 """
@@ -51,34 +51,34 @@ TASK_FIELDS = tuple(field.name for field in dataclasses.fields(TaskConfig))
 class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
     """An env of surgicai-vision.
 
-    What is None is taken from `dataset`, and without one is the default of `TaskConfig`, two views
-    of 224 px, and images. After that nothing is None but `encoder`; `dataset` and `checkpoint` are
-    forgotten: a saved configuration is whole.
+    Values that are None are taken from `dataset` or `checkpoint`. Without these they are the
+    defaults of `TaskConfig`, two views of 224 px, and images. The env then sets `dataset` and
+    `checkpoint` to None, so that a saved configuration is complete by itself.
 
     Attributes:
         task: one of `tasks.task_names()`.
         dataset: a dataset of ours.
         checkpoint: a checkpoint of `surgicai-vision train`, or released:NAME, to take task, views
-            and image size from, in the place of `dataset`.
+            and image size from, instead of `dataset`.
         cameras: views.
         image_size: height and width of an image [px].
         step: step-size preset.
         tolerance: "paper" or "released".
-        reward: "sparse" or "dense".
+        reward: "sparse", "dense" or "staged".
         max_steps: episode limit [control steps].
         scene: the scene.
         randomisation: what differs from episode to episode besides the start.
         action_repeat: control steps that an action is held.
-        hold_jaw: whether the jaw stays as it is where the needle is held at the start.
-        end_on_drop: whether an episode ends when the needle is dropped.
-        advance: how the whole procedure goes on: "success" or "told".
-        encoder: show this encoder's features of the views in place of images.
+        hold_jaw: take the jaw's action as 0 in subtasks that start with the needle held.
+        end_on_drop: end the episode if the needle drops in a subtask that starts with it held.
+        advance: how the whole procedure moves to its next subtask: "success" or "told".
+        encoder: show this encoder's features of the views instead of images.
         encoder_weights: file with the encoder's pretrained weights.
-        encoder_sha256: hash of the weights it must have; empty for any.
-        tasks: several tasks, each a group of its own in LeRobot's results, in the place of `task`;
-            each has its own step limit, whatever `max_steps` says; all else is the same.
-        instructions: which sentences tell the task (`core.instructions`): "standard", or one drawn
-            anew in every episode: "train", "heldout".
+        encoder_sha256: hash that the weights must have; empty for any.
+        tasks: several tasks instead of `task`, each a separate group in LeRobot's results. Each
+            has its own step limit, whatever `max_steps` says; all else is the same.
+        instructions: bank of the sentences that describe the task (`core.instructions`):
+            "standard", or "train" or "heldout", from which every episode draws one.
     """
 
     task: str | None = None
@@ -129,7 +129,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
         self.features_map = {key: renamed.get(key, key) for key in self.features}
 
     def _fill(self, config: TaskConfig, cameras: list[str], image_size: int) -> None:
-        """Fill what is None from the dataset or the checkpoint, else from the arguments."""
+        """Fill values that are None from the dataset or the checkpoint, else from the arguments."""
         features: dict[str, PolicyFeature] = {}
         if self.dataset:
             dataset = open_dataset(Path(self.dataset))
@@ -159,7 +159,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
         return tuple(self.cameras or ())
 
     def task_config(self) -> TaskConfig:
-        """Return the task and its scene; refuses what does not exist."""
+        """Return the task and its scene; refuse values that do not exist."""
         return TaskConfig(**{key: getattr(self, key) for key in TASK_FIELDS})
 
     @property
@@ -187,10 +187,10 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, VectorEnv]]:
-        """Return `n_envs` envs side by side, in processes of their own when asked for.
+        """Return `n_envs` vectorised envs, in separate processes if requested.
 
         A finished env waits for the others (`FreezeAfterEpisodeEnd`): its next episode would leak a
-        step of reward into this one's, and cost its rendering.
+        step of reward into the present one, and would have to be rendered.
         """
         if self.tasks:
             parts = {
@@ -211,7 +211,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
             (self.task_config().task, self.instructions),
         )
         if use_async_envs and n_envs > 1:
-            # LeRobot's choice: a fork would copy the GL context and torch's threads.
+            # As LeRobot does: a fork would copy the GL context and torch's threads.
             vector: VectorEnv = AsyncVectorEnv(
                 [make] * n_envs, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP
             )
@@ -220,7 +220,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
         return {self.type: {0: vector}}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """Return what stands between env and policy: the encoder, when there is one."""
+        """Return the processors between env and policy: the encoder, if there is one."""
         steps = []
         if self.encoder:
             steps = [
@@ -237,7 +237,7 @@ def make_one(
 ) -> gymnasium.Env:
     """Make one env; `told` is its task and the bank of its instructions.
 
-    A function of this module, so that a worker process that unpickles it registers the ids.
+    It is a function of this module so that a worker process that unpickles it registers the ids.
     """
     env = gymnasium.make(gym_id, disable_env_checker=disable_env_checker, **arguments)
     if told is not None and told[1] != STANDARD:
@@ -247,7 +247,7 @@ def make_one(
 
 
 class Instructed(gymnasium.Wrapper):
-    """Tell the task in a sentence that each episode draws by its seed.
+    """Describe the task with a sentence that is drawn by each episode's seed.
 
     Attributes:
         task_description: the sentence of the present episode.
@@ -261,7 +261,7 @@ class Instructed(gymnasium.Wrapper):
         self.task_description = draw_instruction(task, bank, 0)
 
     def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode, by its seed, or by its number where it is given none."""
+        """Begin an episode; its seed, or without one its number, decides the sentence."""
         seed = arguments.get("seed")
         self._episodes += 1
         self.task_description = draw_instruction(
@@ -272,7 +272,7 @@ class Instructed(gymnasium.Wrapper):
 
 
 class NestImages(gymnasium.ObservationWrapper):
-    """Show an env's images as LeRobot expects them: under one key "pixels", by view."""
+    """Arrange an env's images as LeRobot expects them: by view, under the one key "pixels"."""
 
     def __init__(self, env: gymnasium.Env):
         super().__init__(env)

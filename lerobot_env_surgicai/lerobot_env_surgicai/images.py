@@ -18,7 +18,7 @@ from surgicai_vision.training.checkpoint import PREPROCESSING
 
 
 class FrameEncoder(Protocol):
-    """What encodes frames: an encoder, or a `FeatureMemory` of one."""
+    """A callable that encodes frames: an encoder, or a `FeatureMemory` around one."""
 
     def __call__(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the features (B, dim) float32 of images (B, H, W, 3) uint8."""
@@ -26,14 +26,14 @@ class FrameEncoder(Protocol):
 
 @functools.lru_cache(maxsize=2)
 def load_encoder(name: str, weights: str | None, pool: str) -> Encoder:
-    """Load a frozen encoder, once a process for each choice."""
+    """Load a frozen encoder; the two used last stay loaded in this process."""
     return encoders.load_encoder(name, pool, encoders.WeightsSource.of(weights))
 
 
 def identity(encoder: Encoder) -> str:
-    """Return a sha256 (hex) of what a policy trained on an encoder depends on.
+    """Return a sha256 (hex) of everything about an encoder that a trained policy depends on.
 
-    It is over the weights, the preprocessing and the pool.
+    It covers the weights, the preprocessing and the pool.
     """
     card = to_mapping(encoder.card)
     plain = {
@@ -61,7 +61,7 @@ def check_identity(encoder: Encoder, weights_sha256: str, wanted: str, where: st
 def as_uint8(images: torch.Tensor) -> NDArray[np.uint8]:
     """Return (B, 3, H, W) float images in [0, 1] as (B, H, W, 3) uint8.
 
-    Images that were uint8 come back exactly.
+    Images that were uint8 before are restored exactly.
     """
     rounded = (images.detach().float() * 255).round().clamp(0, 255).to(torch.uint8)
     return rounded.permute(0, 2, 3, 1).contiguous().cpu().numpy()
@@ -71,9 +71,9 @@ def as_uint8(images: torch.Tensor) -> NDArray[np.uint8]:
 class FeatureMemory:
     """An encoder that encodes each image once; LeRobot decodes every image again in each epoch.
 
-    An image is known by the hash of its bytes, so another dataset or an augmented image is never
-    mistaken for it. Features are kept as the float16 values they are (`encoders.base`), nothing is
-    rounded.
+    An image is identified by the hash of its bytes, so an image of another dataset or an augmented
+    image is never mistaken for it. Features have float16 values (`encoders.base`) and are stored
+    as float16, so nothing is lost to rounding.
 
     Args:
         encoder: (B, H, W, 3) uint8 → (B, dim) float32, the same for an image in any batch.
@@ -108,7 +108,7 @@ class FeatureMemory:
 def encode(
     encoder: FrameEncoder, batch: Mapping[str, torch.Tensor], views: Sequence[str]
 ) -> NDArray[np.float32]:
-    """Return the features of the views side by side, (B, views × dim) float32."""
+    """Return the concatenated features of the views, (B, views × dim) float32."""
     return np.concatenate(
         [encoder(as_uint8(batch[names.image_key(view)])) for view in views], axis=1
     )

@@ -1,7 +1,7 @@
 """`surgicai_bc`: behaviour cloning on frozen features, as a LeRobot policy.
 
-The network is the `bc` of surgicai-vision. The encoder is no part of the module: it is never saved,
-trained or put into training mode; its name and hashes stand in config.json and are verified
+The network is the `bc` of surgicai-vision. The encoder is not part of the module: it is never
+saved, trained or put into training mode; its name and hashes are in config.json and are verified
 whenever the policy is loaded.
 """
 
@@ -37,7 +37,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
     """Behaviour cloning: frozen features and the tip's pose in, one action out.
 
     Attributes:
-        memoryless: True: an action depends on the present observation alone, so episodes may share
+        memoryless: True: an action depends only on the present observation, so episodes may share
             a batch.
     """
 
@@ -69,11 +69,11 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
     def from_pretrained(
         cls, pretrained_name_or_path: str | Path, *, strict: bool = True, **arguments: object
     ) -> "SurgicaiBcPolicy":
-        """Load a policy; unlike LeRobot's own, a tensor that is missing or unexpected is an error.
+        """Load a policy; unlike in LeRobot's own, a missing or unexpected tensor is an error.
 
         Raises:
-            BadFile: the weights are damaged or of another network.
-            InputError: this is not the encoder it was trained on.
+            BadFile: the weights are damaged or belong to another network.
+            InputError: the encoder is not the one that the policy was trained on.
         """
         try:
             policy: SurgicaiBcPolicy = super().from_pretrained(
@@ -87,14 +87,14 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
         return policy
 
     def get_optim_params(self) -> Iterator[nn.Parameter]:
-        """Return the parameters that are trained: the network's."""
+        """Return the trained parameters, which are the network's."""
         return self.network.parameters()
 
     def reset(self) -> None:
-        """Forget nothing: there is no memory."""
+        """Do nothing: the policy has no memory."""
 
     def train(self, mode: bool = True) -> "SurgicaiBcPolicy":
-        """Switch to training or evaluation; the encoder stays as it is."""
+        """Switch to training or evaluation mode; the encoder is not affected."""
         self._acting = None
         super().train(mode)
         return self
@@ -111,7 +111,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
         if features is not None:
             parts.insert(0, torch.from_numpy(features).to(batch[ACTION].device))
         observed = torch.cat(parts, dim=1)
-        # An epoch may end in a batch of one, of which BatchNorm can take no variance.
+        # An epoch may end with a batch of one, which has no variance for BatchNorm.
         training = self.network.training
         self.network.train(training and len(observed) > 1)
         loss = self.network.loss(observed, batch[ACTION])
@@ -125,11 +125,11 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
-        """Return the action (B, 7); it does not depend on what else is in the batch."""
+        """Return the actions (B, 7); a row's action does not depend on the rest of the batch."""
         acting = self._acting
         if acting is None:
-            # `act` computes in float64 on the CPU, and so may not have its weights moved or trained
-            # under it.
+            # `act` computes in float64 on the CPU, so it needs a copy of the weights that is neither
+            # moved nor trained.
             acting = copy.deepcopy(self.network).cpu().eval()
             object.__setattr__(self, "_acting", acting)  # not a submodule: it must not be saved
         poses = batch[OBS_STATE].float().cpu().numpy()
@@ -140,7 +140,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
     def _features(
         self, batch: dict[str, Tensor], encoder: FrameEncoder | None
     ) -> NDArray[np.float32] | None:
-        """Return the views' features side by side (B, F) float32; None without images."""
+        """Return the views' concatenated features (B, F) float32; None without images."""
         if encoder is None:
             return None
         for view in self.config.views:

@@ -1,8 +1,8 @@
-"""`surgicai_checkpoint`: an agent of surgicai-vision as a LeRobot policy, for evaluation alone.
+"""`surgicai_checkpoint`: an agent of surgicai-vision as a LeRobot policy, for evaluation only.
 
-The agent is the one that `surgicai-vision evaluate` runs. It is handed the images and the state of
-LeRobot's batch as if a robot told them; what it plans ahead it remembers for each row of the batch
-until LeRobot resets it.
+The agent is the one that `surgicai-vision evaluate` runs. It gets the images and the state of
+LeRobot's batch as if they came from a robot. It keeps its plan for each row of the batch until
+LeRobot resets it.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ from surgicai_vision.training import policies, released
 
 @dataclass
 class _Told:
-    """What LeRobot's batch tells of one robot.
+    """The state of one robot, as given by LeRobot's batch.
 
     Attributes:
         state: `observation.state`, (7,).
@@ -39,17 +39,17 @@ class _Told:
         return self.state
 
     def setpoint(self) -> NDArray[np.float32]:
-        """Refuse: LeRobot's batch does not hold it."""
+        """Refuse: LeRobot's batch does not contain the set point."""
         raise InputError(
             "LeRobot's env does not provide set points; use 'surgicai-vision evaluate'."
         )
 
     def both_arms(self) -> NDArray[np.float32]:
-        """Refuse: LeRobot's batch holds one arm."""
+        """Refuse: LeRobot's batch contains only one arm."""
         raise InputError("LeRobot's env provides only one arm; use 'surgicai-vision evaluate'.")
 
     def enter(self, phase: int) -> None:
-        """Refuse: a subtask's policy changes no arm."""
+        """Refuse: a subtask's policy does not change the arm."""
         raise InputError("A subtask's policy does not change the arm.")
 
 
@@ -78,18 +78,18 @@ class SurgicaiCheckpointPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy 
             )
         self._slots = 0
         self._seed = 0
-        self.placed = nn.Parameter(torch.zeros(()), requires_grad=False)  # says the device
+        self.placed = nn.Parameter(torch.zeros(()), requires_grad=False)  # gives the device
 
     def get_optim_params(self) -> Iterator[nn.Parameter]:
         """Return no parameters."""
         return iter(())
 
     def reset(self) -> None:
-        """Forget all episodes."""
+        """Discard the plans of all episodes."""
         self._slots = 0
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Refuse: it is trained by `surgicai-vision train`."""
+        """Refuse: the policy is trained by `surgicai-vision train`."""
         raise InputError("surgicai_checkpoint cannot be trained here; use 'surgicai-vision train'.")
 
     @torch.no_grad()

@@ -14,7 +14,7 @@ def make_surgicai_bc_pre_post_processors(
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Return the pipelines around the policy.
 
-    The state is brought to mean 0 and std 1; images and actions stay as they are.
+    The state is normalised to mean 0 and std 1; images and actions are not changed.
     """
     statistics = dict(dataset_stats or {})
     if "std" in statistics.get(OBS_STATE, {}):

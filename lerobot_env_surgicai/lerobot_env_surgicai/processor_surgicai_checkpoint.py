@@ -1,4 +1,4 @@
-"""`surgicai_checkpoint`: LeRobot's standard pre- and post-processing, which changes nothing."""
+"""`surgicai_checkpoint`: LeRobot's standard pre- and post-processing, without normalisation."""
 
 import torch
 from lerobot.processor import PolicyProcessorPipeline, make_default_pre_post_processors
