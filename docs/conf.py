@@ -34,7 +34,7 @@ myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "substitution
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
-autodoc_mock_imports = ["genpy", "rclpy", "rosgraph", "rospy"]  # ROS itself, which is in no package index
+autodoc_mock_imports = ["genpy", "rclpy", "rosgraph", "rospy"]  # ROS itself; in no package index
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False

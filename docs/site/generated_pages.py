@@ -40,19 +40,19 @@ INNER = (
 """Modules that only the package itself uses; they have no section in the reference."""
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = {
-    "surgicai_vision.core": "names, config, errors, files and the executor: what all stages share",
+    "surgicai_vision.core": "shared by all stages: names, config, errors, files and the executor",
     "surgicai_vision.scene": "scene: the arms, the needle, the thread, the phantom, the cameras",
     "surgicai_vision.envs": "env: the gymnasium environments",
     "surgicai_vision.demos": "demos: demonstrators, recording, imports",
-    "surgicai_vision.teleoperation": "demos by hand: keyboard and gamepad",
+    "surgicai_vision.teleoperation": "demos: teleoperation with keyboard and gamepad",
     "surgicai_vision.dataset": "dataset: demonstrations rendered into LeRobot datasets",
     "surgicai_vision.features": "features: encoders by name, the cache, the probe",
     "encoders": "features: the frozen encoders themselves",
     "surgicai_vision.training": "policy: training and checkpoints",
     "policies": "policy: the policies themselves",
     "surgicai_vision.evaluation": "evaluation: rollouts, measures, statistics, robustness",
-    "surgicai_vision.rl": "reinforcement and offline learning, by the libraries of the extra rl",
-    "surgicai_vision.robot": "a dVRK that speaks CRTK, simulated or driven, over ROS 2's messages",
+    "surgicai_vision.rl": "reinforcement and offline learning, with the libraries of the extra rl",
+    "surgicai_vision.robot": "a dVRK, simulated or driven, over CRTK with ROS 2 messages",
     "surgicai_vision.report": "report: one page from stored results",
     "surgicai_vision.experiments": "whole runs: quickstart, sweep, DAgger",
 }
@@ -101,8 +101,8 @@ def command_pages() -> Iterator[tuple[str, str]]:
         f"""\
 # Commands
 
-Every verb of `{PROGRAM}`, in the order of the flow. These pages are written from the command line's
-own parser when the site is built: they are what `{PROGRAM} VERB --help` prints.
+Every verb of `{PROGRAM}`, in the order of the flow. These pages are generated from the command
+line's own parser when the site is built: they show what `{PROGRAM} VERB --help` prints.
 
 | verb | what it does |
 |---|---|
@@ -145,7 +145,7 @@ def command_page(words: str, text: str, command: App, level: int) -> str:
     shown = options_of(command.assemble_argument_collection(parse_docstring=True))
     if shown:
         parts += [f"{'#' * (level + 1)} Options", shown]
-    parts.append("And [those of every command](index.md#options-of-every-command).")
+    parts.append("See also the [options of every command](index.md#options-of-every-command).")
     return "\n\n".join(parts) + "\n"
 
 
@@ -228,8 +228,8 @@ def api_pages() -> Iterator[tuple[str, str]]:
         f"""\
 # Python reference
 
-Every package's public modules, from their docstrings; [](../../python.md) says which few of them
-most programs need.
+Every package's public modules, from their docstrings; [](../../python.md) lists the few that most
+programs need.
 
 | package | stage |
 |---|---|
@@ -303,7 +303,7 @@ def example_pages() -> Iterator[tuple[str, str]]:
         f"""\
 # Examples
 
-Short programs against the public Python API; the tests run each of them. They stand in `examples/`:
+Short programs that use the public Python API; the tests run each of them. They are in `examples/`:
 
 | example | what it shows |
 |---|---|

@@ -22,7 +22,7 @@ def make_env(
         n_envs: envs per task.
         use_async_envs: run each env in a separate process.
         cfg: a `SurgicaiEnv`, or another configuration whose `task` is a comma-separated list of
-            tasks; without either, all five subtasks.
+            tasks; by default all five subtasks.
     """
     if isinstance(cfg, SurgicaiEnv):
         return cfg.create_envs(n_envs, use_async_envs)

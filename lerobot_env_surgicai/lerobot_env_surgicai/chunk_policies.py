@@ -258,7 +258,9 @@ def _config[Config: PreTrainedConfig](
     """
     for name, value in recipe.settings.items():
         if name in ours:
-            raise InputError(f"settings: {name} follows from the recipe; leave {value} out.")
+            raise InputError(
+                f"settings: {name} follows from the recipe; remove it (given: {value})."
+            )
         check_name("setting", name, kind.__dataclass_fields__)
     lists = {
         name: tuple(value) if isinstance(value, list) else value

@@ -95,7 +95,7 @@ class SurgicaiBcConfig(PreTrainedConfig):  # type: ignore[misc]  # mypy skips Le
         action = self.action_feature
         if action is None or tuple(action.shape) != (len(names.ACTION_NAMES),):
             raise InputError(
-                f"surgicai_bc acts in {len(names.ACTION_NAMES)} values; given: {action}."
+                f"surgicai_bc needs actions of {len(names.ACTION_NAMES)} values; given: {action}."
             )
         self.input_features = kept
 
@@ -109,7 +109,7 @@ class SurgicaiBcConfig(PreTrainedConfig):  # type: ignore[misc]  # mypy skips Le
             self.views = [view for view in camera_names() if names.image_key(view) in visual]
             if not self.views:
                 raise InputError(
-                    f"surgicai_bc found no view of {', '.join(camera_names())} "
+                    f"surgicai_bc found none of the views {', '.join(camera_names())} "
                     f"in {', '.join(given)}."
                 )
         return [*map(names.image_key, self.views), *state]

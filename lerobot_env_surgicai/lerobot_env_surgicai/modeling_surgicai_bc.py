@@ -82,7 +82,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
         except (RuntimeError, SafetensorError) as error:
             reason = " ".join(str(error).split())[:200]
             raise BadFile(
-                f"{pretrained_name_or_path} holds no complete weights of surgicai_bc ({reason})."
+                f"{pretrained_name_or_path} has no complete weights for surgicai_bc ({reason})."
             ) from None
         return policy
 
@@ -128,8 +128,8 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
         """Return the actions (B, 7); a row's action does not depend on the rest of the batch."""
         acting = self._acting
         if acting is None:
-            # `act` computes in float64 on the CPU, so it needs a copy of the weights that is neither
-            # moved nor trained.
+            # `act` computes in float64 on the CPU, so it needs a copy of the weights that is not
+            # moved or trained.
             acting = copy.deepcopy(self.network).cpu().eval()
             object.__setattr__(self, "_acting", acting)  # not a submodule: it must not be saved
         poses = batch[OBS_STATE].float().cpu().numpy()

@@ -67,13 +67,13 @@ class SurgicaiCheckpointPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy 
         unknown = set(inputs.vector) - {names.STATE, names.CLOCK}
         if unknown:
             raise InputError(
-                f"{config.checkpoint} is fed {', '.join(sorted(unknown))}, which LeRobot's env "
+                f"{config.checkpoint} needs {', '.join(sorted(unknown))}, which LeRobot's env "
                 "does not provide; use 'surgicai-vision evaluate'."
             )
         self._agent = acting_agent(folder, WeightsSource.of(config.encoder_weights))
         if self._agent.depth:
             raise InputError(
-                f"{config.checkpoint} sees depth, which LeRobot's env does not show; "
+                f"{config.checkpoint} needs depth, which LeRobot's env does not provide; "
                 "use 'surgicai-vision evaluate'."
             )
         self._slots = 0

@@ -1,6 +1,6 @@
 """LeRobot plug-in: importing it registers the robot `dvrk` and the teleoperator `surgicai_page`.
 
-`lerobot-teleoperate`, `lerobot-record` and `lerobot-rollout` import every distribution called
+`lerobot-teleoperate`, `lerobot-record` and `lerobot-rollout` import every distribution named
 `lerobot_robot_…`.
 """
 

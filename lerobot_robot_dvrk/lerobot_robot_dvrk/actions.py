@@ -1,18 +1,18 @@
-"""Actions: what the values of a LeRobot action mean, and where they tell the arms to go.
+"""Actions: what the values of a LeRobot action mean, and the motions they command.
 
-* increments: dx.vel … dyaw.vel, jaw.vel, steps of the active arm's set point in its base: what our
-  policies, our datasets and `surgicai_page` speak.
-* delta: delta_x, delta_y, delta_z and gripper, of which 0 closes, 1 stays, 2 opens: `gamepad` and
+* increments: dx.vel … dyaw.vel, jaw.vel, steps of the active arm's set point in its base; used by
+  our policies, our datasets and `surgicai_page`.
+* delta: delta_x, delta_y, delta_z and gripper (0 closes, 1 stays, 2 opens); used by `gamepad` and
   `keyboard_ee`.
-* leader: the leader's joints, JOINT.pos: `so101_leader`, `koch_leader` and any other arm.
-* absolute: both arms' poses and jaws, 16 values: policies of the field's data.
+* leader: the leader's joints, JOINT.pos; used by `so101_leader`, `koch_leader` and any other arm.
+* absolute: both arms' poses and jaws, 16 values; used by policies trained on the field's data.
 
-Where a person leads (delta, leader) the axes are those of the endoscope's view: right, up and away
-from the viewer. LeRobot's own delta_x, delta_y and delta_z are forward, left and up: away, left and
-up. What a leader's joint has moved since the last action is added to the set point, however long
-that takes; a joint's "-right" turns its sign, and "PSM1:right" is for that arm alone.
+With delta and leader, the axes are those of the endoscope's view: right, up and away from the
+viewer. LeRobot's own delta_x, delta_y and delta_z (forward, left, up) are away, left and up in this
+view. A leader joint's motion since the last action is added to the set point, over as many steps as
+that takes. For a joint, "-right" reverses the sign, and "PSM1:right" moves only that arm.
 
-Values end in `.pos` or `.vel`, since `lerobot-rollout` feeds a policy no others.
+Names of values end in `.pos` or `.vel`, since `lerobot-rollout` passes no others to a policy.
 """
 
 import math
@@ -42,7 +42,7 @@ LEADER = MappingProxyType(
         "gripper": "jaw",
     }
 )
-"""Joint of LeRobot's six-joint leaders → which way it moves the tip."""
+"""Joint of LeRobot's six-joint leaders → direction in which it moves the tip."""
 WAYS: Mapping[str, tuple[int, float, float]] = MappingProxyType(
     {
         "right": (0, -1.0, 5e-4),
@@ -54,16 +54,16 @@ WAYS: Mapping[str, tuple[int, float, float]] = MappingProxyType(
         "jaw": (6, 1.0, JAW_OPEN / 100.0),
     }
 )
-"""Way → its place among the seven increments, its sign in the view's axes (x left, y up, z away),
-and what one unit of a joint moves [m, rad]: leaders' joints go from -100 to 100, grippers from 0 to
-100, so that a whole turn of a joint is 100 mm, or 180°."""
+"""Direction → its index among the seven increments, its sign in the view's axes (x left, y up, z
+away), and the motion per unit of a joint [m, rad]. Leaders' joints go from -100 to 100, grippers
+from 0 to 100, so that the full range of a joint is 100 mm, or 180°."""
 MOST_WAITING = 25.0
-"""Steps that a leader may be ahead of the tip; what is more is left out."""
+"""Steps that a leader may be ahead of the tip; any further motion is dropped."""
 POSITIONS = tuple(f"{name}.pos" for name in names.ABSOLUTE_STATE_NAMES)
-"""What is observed where the action is "absolute": both arms' tips in the frame of their
+"""The observation's values if the action is "absolute": both arms' tips in the frame of their
 `measured_cp`, quaternion x y z w, and the angle between the fingers."""
 TARGETS = tuple(f"{name}.pos" for name in names.ABSOLUTE_ACTION_NAMES)
-"""The same of the set points: an absolute action."""
+"""The same values for the set points: an absolute action."""
 
 Values = Mapping[str, float]
 
@@ -77,18 +77,18 @@ class Reader(Protocol):
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Return the arms it may move; () is the active one."""
+        """Return the arms it may move; () means the active one."""
 
     def moves(self, action: Values, robot: DrivenRobot) -> Mapping[str, Sequence[float]]:
-        """Return arm → seven increments in [-1, 1], of an action; none for `targets`."""
+        """Return arm → seven increments in [-1, 1]; empty if the action gives `targets`."""
 
     def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
-        """Return arm → its set point, of an action; none for `moves`."""
+        """Return arm → its set point; empty if the action gives `moves`."""
 
 
 @final
 class Increments:
-    """Our own: seven increments of the active arm."""
+    """Our own action: seven increments of the active arm."""
 
     features = tuple(f"{name}.vel" for name in names.ACTION_NAMES)
     arms = ()
@@ -97,7 +97,7 @@ class Increments:
         pass
 
     def moves(self, action: Values, robot: DrivenRobot) -> Mapping[str, Sequence[float]]:
-        """Return the increments; values that are missing are 0."""
+        """Return the increments; missing values are 0."""
         return {robot.active: [float(action.get(name, 0.0)) for name in self.features]}
 
     def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
@@ -129,14 +129,14 @@ class Delta:
 
 @final
 class Leader:
-    """A leader arm: what its joints move is added to the set points.
+    """A leader arm, whose joint motions are added to the set points.
 
     Args:
         step: the largest step of one action.
-        leader: joint → way, see the module's docstring.
+        leader: joint → direction; see the module's docstring.
 
     Raises:
-        InputError: no such way or arm.
+        InputError: `leader` is empty, or names an unknown direction or arm.
     """
 
     def __init__(self, step: StepSize, leader: Mapping[str, str]):
@@ -158,7 +158,7 @@ class Leader:
         self._waiting: dict[str, list[float]] = {}
 
     def moves(self, action: Values, robot: DrivenRobot) -> Mapping[str, Sequence[float]]:
-        """Return the increments of what the joints have moved since the last action."""
+        """Return the increments for the joints' motion since the last action."""
         for name, (said, place, steps) in self._ways.items():
             value = float(action.get(name, math.nan))
             if not math.isfinite(value):
@@ -184,7 +184,7 @@ class Leader:
 
 @final
 class Absolute:
-    """Set points of both arms, called as what is observed or as in the field's datasets."""
+    """Set points of both arms, named as in the observation or as in the field's datasets."""
 
     features = TARGETS
     arms = tuple(PSM_NAMES)
@@ -223,13 +223,13 @@ class Absolute:
 ACTIONS: Mapping[str, Callable[[StepSize, Mapping[str, str]], Reader]] = MappingProxyType(
     {INCREMENTS: Increments, "delta": Delta, "leader": Leader, ABSOLUTE: Absolute}
 )
-"""What an action's values are → what reads them."""
+"""Kind of action → its reader."""
 
 
 def observed(robot: DrivenRobot) -> dict[str, float]:
-    """Return `POSITIONS` of both arms as measured now.
+    """Return the current measured `POSITIONS` of both arms.
 
-    Of a quaternion's two signs it is the one nearer to the arm's start.
+    Each quaternion has the sign that is closer to the arm's start.
     """
     values: list[float] = []
     for arm in PSM_NAMES:
@@ -246,7 +246,7 @@ def observed(robot: DrivenRobot) -> dict[str, float]:
 
 
 def _in_base(robot: DrivenRobot, arm: str, values: list[float]) -> list[float]:
-    """Return increments in the view's axes as those in an arm's base."""
+    """Return increments in the view's axes, converted to an arm's base."""
     _, base = robot.frame(arm)
     turn = poses.rotation(poses.invert(base))
     a, b, c, d, e, f, jaw = values

@@ -1,6 +1,6 @@
-"""Board: what a robot of this process saw last, for a teleoperator that shows it.
+"""Board: the latest observation of this process's robot, for a teleoperator that shows it.
 
-LeRobot hands a teleoperator nothing of the robot; the page that a person looks at must show its
+LeRobot gives a teleoperator no access to the robot, but the operator's page must show the robot's
 images and know which arm is active.
 """
 
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 @dataclass
 class Board:
-    """What was seen last.
+    """The latest observation.
 
     Attributes:
         images: view → (height, width, 3).
         arm: the active arm, "" before a robot is connected.
-        jaw: one finger's angle of its set point [rad].
-        message: what a person should know.
-        success: the served simulation's judge sees success.
+        jaw: one finger's angle in the active arm's set point [rad].
+        message: message for the operator.
+        success: the served simulation judges that the task has succeeded.
     """
 
     images: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
@@ -30,4 +30,4 @@ class Board:
 
 
 BOARD = Board()
-"""The one of this process."""
+"""The board of this process."""

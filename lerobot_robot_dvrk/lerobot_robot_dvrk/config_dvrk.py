@@ -1,4 +1,4 @@
-"""`dvrk`: a da Vinci Research Kit over CRTK, as a LeRobot robot: its settings."""
+"""Settings of `dvrk`: a da Vinci Research Kit over CRTK, as a LeRobot robot."""
 
 from dataclasses import dataclass, field
 
@@ -23,28 +23,30 @@ class DvrkConfig(RobotConfig):  # type: ignore[misc]  # mypy skips LeRobot
     """Settings of `dvrk`; guards, topics, frames and jaw_scale are those of `robot drive`.
 
     Attributes:
-        task: decides the active arm; of the whole procedure the served simulation says which.
-        action: what an action's values are, a key of `actions.ACTIONS`.
+        task: decides the active arm; in the whole procedure, the served simulation decides it.
+        action: kind of action, a key of `actions.ACTIONS`.
         step: preset of the largest step of one action.
-        leader: joint of a leader arm → which way it moves the tip (`actions`); where `action` is
-            "leader".
+        leader: joint of a leader arm → direction in which it moves the tip (`actions`), if `action`
+            is "leader".
         views: views whose images are read.
         image_size: height and width of the images [pixel].
         simulated: the robot is `robot serve`, which begins episodes and judges them.
-        send: send what the guards let through; a served simulation is always sent.
-        clock: "real", or "stepped" where the simulation is served with --clock stepped.
+        send: send the commands that the guards let through; to a served simulation they are always
+            sent.
+        clock: "real", or "stepped" if the simulation is served with --clock stepped.
         seed: seed of the simulation's first start.
         reset_after: time after a success at which the simulation's next start begins [s]; 0: only
-            when it is asked for.
-        dead_man: topic of the sensor_msgs/Joy that a person holds; a served simulation needs none.
+            on request.
+        dead_man: sensor_msgs/Joy topic of the switch that a person holds; a served simulation needs
+            none.
         compressed: read compressed images.
         guards: limits that cannot be switched off.
-        topics: topic of ours → the robot's own name of it.
-        frames: the robot's frames, where they differ from ours.
-        jaw_scale: one finger's angle over the robot's jaw angle.
-        transport: what carries the messages.
+        topics: our topic → the robot's own name for it.
+        frames: the robot's frames, if they differ from ours.
+        jaw_scale: ratio of one finger's angle to the robot's jaw angle.
+        transport: library that carries the messages.
         interface: the network interface.
-        domain: ROS's domain number.
+        domain: the ROS domain number.
     """
 
     task: str = "grasp"
@@ -82,14 +84,16 @@ class DvrkConfig(RobotConfig):  # type: ignore[misc]  # mypy skips LeRobot
                 "the subtask."
             )
         if not self.simulated and not self.dead_man.startswith("/"):
-            raise InputError("a person holds a robot: dead_man must be the topic of a Joy.")
+            raise InputError(
+                "a real robot needs a dead-man's switch: dead_man must be a Joy topic, /NAME."
+            )
         self.drive_config()
 
     def drive_config(self) -> DriveConfig:
         """Return how the robot is driven.
 
         Raises:
-            InputError: a robot without a workspace of its own, or with a clock that is stepped.
+            InputError: a real robot has no workspace in `guards`, or a stepped clock.
         """
         sends = self.send or self.simulated
         return DriveConfig(self.guards, sends, self.simulated, self.clock == "stepped")

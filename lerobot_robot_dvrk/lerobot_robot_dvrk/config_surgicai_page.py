@@ -1,4 +1,4 @@
-"""`surgicai_page`: a browser's keyboard and gamepad as a LeRobot teleoperator: its settings."""
+"""Settings of `surgicai_page`: keyboard and gamepad in a browser as a LeRobot teleoperator."""
 
 from dataclasses import dataclass, field
 
@@ -17,12 +17,12 @@ class SurgicaiPageConfig(TeleoperatorConfig):  # type: ignore[misc]  # mypy skip
     """Settings of `surgicai_page`.
 
     Attributes:
-        port: of the page on this machine's loopback, 0 for any.
+        port: port of the page on this machine's loopback; 0 for any free one.
         views: views of the robot that the page shows.
-        axes: whose axes the keys mean: those of the endoscope's "view", or the arm's "base".
+        axes: axes that the keys follow: those of the endoscope's "view" or of the arm's "base".
         speed: share of the step size that a key or a full deflection commands.
-        step: preset of the largest step of one action, as the robot's.
-        arm: the arm before a robot says which is active, "PSM1" or "PSM2".
+        step: preset of the largest step of one action; give the same as for the robot.
+        arm: the arm assumed until a robot reports which is active, "PSM1" or "PSM2".
     """
 
     port: int = 8765

@@ -3,13 +3,12 @@
     lerobot-teleoperate --robot.type=dvrk --robot.simulated=true --robot.task=grasp \
         --teleop.type=surgicai_page --fps=50
 
-What is sent passes the guards of `robot drive` (`robot.guards`): where they find something, or an
-arm is paused or stopped, nothing is sent, the log says why, and the arm stays at its set point. An
-action is meant for one control step of 20 ms: run LeRobot's loops with 50 frames a second.
+Every command passes the guards of `robot drive` (`robot.guards`). If they find a problem, or an arm
+is paused or stopped, nothing is sent, the log says why, and the arm stays at its set point. An
+action is meant for one control step of 20 ms: run LeRobot's loops at 50 frames per second.
 
-A served simulation begins its next start a while after a success, when an action says so
-(`surgicai_page`), and when only observations are asked for, as `lerobot-rollout` does between
-episodes.
+A served simulation begins its next start some time after a success, when an action requests it
+(`surgicai_page`), and when only observations are read, as `lerobot-rollout` does between episodes.
 """
 
 import logging
@@ -36,10 +35,10 @@ from surgicai_vision.robot.setpoints import Setpoints
 from surgicai_vision.robot.transport import RenamedTransport, open_transport
 
 RESET = "simulation.reset"
-"""Key of an action that asks a served simulation for its next start (1) or the same (2)."""
+"""Action key that requests the next start (1) or the same start (2) of a served simulation."""
 NEXT, SAME = 1.0, 2.0
 OBSERVED_ONLY = 5
-"""Observations in a row without an action after which an episode counts as over."""
+"""Consecutive observations without an action after which an episode counts as over."""
 
 logger = logging.getLogger(__name__)
 
@@ -69,18 +68,18 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         self._solved: float | None = None
         self._told = ""
 
-    # -- what LeRobot asks of any robot ------------------------------------------------------------
+    # -- what LeRobot requires of any robot --------------------------------------------------------
 
     @property
     def observation_features(self) -> dict[str, type | tuple[int, ...]]:
-        """Return the observation's values, `float` or the shape of an image."""
+        """Return the observation's values → `float` or an image's shape."""
         size = self.config.image_size
         images = dict.fromkeys(self.config.views, (size, size, 3))
         return {**dict.fromkeys(self._state_names, float), **images}
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Return the action's values."""
+        """Return the action's values → `float`."""
         return dict.fromkeys(self._reader.features, float)
 
     @property
@@ -90,7 +89,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
 
     @property
     def is_calibrated(self) -> bool:
-        """Return True: a dVRK's joints are homed by itself, and the guards look."""
+        """Return True: a dVRK homes its joints itself, and the guards check it."""
         return True
 
     def calibrate(self) -> None:
@@ -103,7 +102,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         """Find the robot; a served simulation begins the episode of the first seed.
 
         Raises:
-            DeviceAlreadyConnectedError: it is connected.
+            DeviceAlreadyConnectedError: it is already connected.
             InputError: the settings cannot be used.
             SurgicaiError: no robot answers.
         """
@@ -145,7 +144,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
             logger.warning("dry run: nothing is sent; --robot.send=true sends it")
 
     def disconnect(self) -> None:
-        """Leave the robot, which stays at its last set point.
+        """Disconnect from the robot, which stays at its last set point.
 
         Raises:
             DeviceNotConnectedError: it is not connected.
@@ -157,7 +156,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         stack.close()
 
     def get_observation(self) -> dict[str, float | NDArray[np.uint8]]:
-        """Return what is measured now, and the newest images."""
+        """Return the current measurements and the newest images."""
         self._check_connected()
         self._client.update()
         self._observations += 1
@@ -176,10 +175,10 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         return {**seen, **images}
 
     def send_action(self, action: Mapping[str, float]) -> Mapping[str, float]:
-        """Send an action, if the guards let it through, and return it.
+        """Send an action if the guards let it through; return it in any case.
 
         Args:
-            action: `action_features`; what it lacks is left as it is.
+            action: values of `action_features`; missing ones command no motion.
         """
         self._check_connected()
         self._observations = 0
@@ -221,7 +220,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         return self._setpoints.of_moves(self._reader.moves(action, self._robot), now)
 
     def _follow_the_judge(self) -> None:
-        """Take over the subtask the judge says, and begin the next start where one is due."""
+        """Enter the subtask that the judge reports, and begin the next start if one is due."""
         judged = self._client.judgement()
         if not judged:
             return
@@ -253,7 +252,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         logger.info("start %d", seed)
 
     def _tell(self, problem: str) -> None:
-        """Log why nothing is sent, when that changes."""
+        """Log the reason why nothing is sent, when it changes."""
         if problem == self._told:
             return
         self._told = problem
@@ -269,5 +268,5 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
 
 
 def _held() -> float:
-    """Return the age of a dead-man's switch that a served simulation does not need [s]."""
+    """Return 0, the time since the switch was held [s]: a served simulation needs no switch."""
     return 0.0

@@ -1,12 +1,12 @@
-"""`surgicai_page`: our keyboard and gamepad, by a page in a browser, as a LeRobot teleoperator.
+"""`surgicai_page`: keyboard and gamepad in a browser page, as a LeRobot teleoperator.
 
 The page is that of `surgicai-vision teleoperate`: it listens on the loopback under a random token,
-needs no X server, and a gamepad on the viewer's own machine works. It shows what a robot `dvrk` of
-this process saw last (`board`). → or Enter asks a served simulation for its next start, ← for the
-same again.
+needs no X server, and works with a gamepad on the viewer's own machine. It shows the latest
+observation of this process's robot `dvrk` (`board`). → or Enter requests the next start of a served
+simulation, ← the same start again.
 
-The actions are the increments of `dvrk` in the active arm's base. Keys mean the endoscope's axes
-(`envs.absolute.T_WORLD_VIEW`); its place over the arms is the simulation's.
+The actions are the increments of `dvrk` in the active arm's base. Keys follow the endoscope's axes
+(`envs.absolute.T_WORLD_VIEW`); its position above the arms is that of the simulation.
 """
 
 import logging
@@ -34,14 +34,14 @@ from surgicai_vision.teleoperation.session import Status
 from surgicai_vision.teleoperation.web import WebView
 
 SHOWN_S = 0.04
-"""Shortest time between two images that the page is shown [s]."""
+"""Shortest time between two images shown on the page [s]."""
 
 logger = logging.getLogger(__name__)
 
 
 @final
 class SurgicaiPage(Teleoperator):  # type: ignore[misc]  # mypy skips LeRobot
-    """A page; see the module's docstring.
+    """The page as a teleoperator; see the module's docstring.
 
     Args:
         config: its settings.
@@ -62,7 +62,7 @@ class SurgicaiPage(Teleoperator):  # type: ignore[misc]  # mypy skips LeRobot
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Return the action's values: seven increments."""
+        """Return the action's values → `float`: seven increments."""
         return dict.fromkeys(Increments.features, float)
 
     @property
@@ -93,20 +93,20 @@ class SurgicaiPage(Teleoperator):  # type: ignore[misc]  # mypy skips LeRobot
         """Serve the page and log its address.
 
         Raises:
-            DeviceAlreadyConnectedError: it is served.
+            DeviceAlreadyConnectedError: it is already served.
             InputError: the port is not free.
         """
         if self._stack is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         with ExitStack() as stack:
-            title = "A dVRK, by LeRobot"
+            title = "dVRK, driven by LeRobot"
             self._page = stack.enter_context(
                 WebView(tuple(self.config.views), title, self.config.port)
             )
             self._stack = stack.pop_all()
         self._device: Device = self._page
         for line in self._page.server.invitation:
-            logger.warning(line)  # LeRobot's scripts show no less
+            logger.warning(line)  # LeRobot's scripts hide lower levels
 
     def disconnect(self) -> None:
         """Close the page.
@@ -121,7 +121,7 @@ class SurgicaiPage(Teleoperator):  # type: ignore[misc]  # mypy skips LeRobot
         stack.close()
 
     def get_action(self) -> dict[str, float]:
-        """Return what is held now, and whether another start is asked for."""
+        """Return the increments of the held inputs, and a requested start."""
         if self._stack is None:
             raise DeviceNotConnectedError(f"{self} is not connected; call connect() first.")
         given = self._device.poll()
@@ -140,7 +140,7 @@ class SurgicaiPage(Teleoperator):  # type: ignore[misc]  # mypy skips LeRobot
         return action
 
     def _increments(self, given: Input) -> list[float]:
-        """Return the seven increments of an input."""
+        """Return the seven increments for an input."""
         speed = self.config.speed * (FINE if given.fine else 1.0)
         axes = self._axes()
         moved = axes @ _limited(given.move) * speed
@@ -158,7 +158,7 @@ class SurgicaiPage(Teleoperator):  # type: ignore[misc]  # mypy skips LeRobot
         return found
 
     def _jaw(self, given: Input, speed: float) -> float:
-        """Return the jaw's increment: what is held, or the rest of a toggle."""
+        """Return the jaw's increment: from the held input, or the rest of a toggle."""
         if JAW in given.events:
             goal = 0.0 if BOARD.jaw > CLOSE_ABOVE else OPENED
             self._jaw_remaining = (goal - BOARD.jaw) / self._jaw_step
@@ -170,7 +170,7 @@ class SurgicaiPage(Teleoperator):  # type: ignore[misc]  # mypy skips LeRobot
         return move
 
     def _show(self, given: Input) -> None:
-        """Show what the robot saw last."""
+        """Show the robot's latest observation."""
         now = time.monotonic()
         if now - self._shown < SHOWN_S or not self._page.wants_image():
             return
@@ -199,6 +199,6 @@ class SurgicaiPage(Teleoperator):  # type: ignore[misc]  # mypy skips LeRobot
 
 
 def _limited(vector: Vector) -> NDArray[np.float64]:
-    """Return a vector no longer than 1: a diagonal is no faster than an axis."""
+    """Limit a vector's length to 1, so that a diagonal is no faster than an axis."""
     array: NDArray[np.float64] = np.array(vector, dtype=np.float64)
     return array / max(1.0, float(np.linalg.norm(array)))

@@ -1,11 +1,11 @@
-"""Check a LeRobot dataset, whoever wrote it.
+"""Check a LeRobot dataset from any source.
 
     report = check_dataset(Path("dataset"))
-    report.ok, report.problems        # each problem one line
+    report.ok, report.problems        # one line per problem
 
-LeRobot's metadata must agree with the data and with each other, and every episode must be whole as
-`verify` has it. The digest is that over the files. A dataset of surgicai-vision gets that package's
-own check.
+LeRobot's metadata files must agree with the data and with each other, and every episode must be
+whole as `verify` defines it. The digest is over the data and video files. A dataset of
+surgicai-vision gets that package's own check.
 """
 
 import tempfile
@@ -22,7 +22,7 @@ from surgicai_vision.dataset.lerobot_files import INFO, LeRobotFiles
 
 
 def check_dataset(path: Path, progress: Progress = silent) -> CheckReport:
-    """Read all of a dataset and report what is wrong with it.
+    """Read a whole dataset and report its problems.
 
     Args:
         path: a LeRobot v3 dataset.
@@ -48,7 +48,7 @@ def check_dataset(path: Path, progress: Progress = silent) -> CheckReport:
     if (info.get("total_frames"), info.get("total_episodes")) != (start, len(rows)):
         problems.append(
             f"{INFO}: it counts {info.get('total_episodes')} episodes and "
-            f"{info.get('total_frames')} frames; {len(rows)} and {start} are whole."
+            f"{info.get('total_frames')} frames; {len(rows)} episodes and {start} frames are whole."
         )
     written = [
         tuple(row.get(key) for key in ("length", "dataset_from_index", "dataset_to_index"))

@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     except SurgicaiError as error:
         return _fail(str(error), error.exit_code)
     except KeyboardInterrupt:
-        return _fail("interrupted; the dataset is as it was.", 1)
+        return _fail("interrupted; the dataset is unchanged.", 1)
 
 
 def _fail(text: str, exit_code: int) -> int:
@@ -51,7 +51,7 @@ def _fail(text: str, exit_code: int) -> int:
 
 @app.command
 def check(dataset: Dataset, /, *, as_json: Json = False) -> int:
-    """Read all of a dataset and print one line a problem.
+    """Read a whole dataset and print one line per problem.
 
     Args:
         dataset: Any LeRobot v3 dataset.
@@ -82,7 +82,7 @@ def repair(
 
     Args:
         dataset: Any LeRobot v3 dataset.
-        out: Folder to make; without it DIR itself is replaced and stays as DIR.broken.
+        out: Folder to create. By default DIR is replaced, and the original stays as DIR.broken.
         as_json: Print the result as one JSON object, the last line of stdout.
     """
     console = Console()

@@ -2,11 +2,11 @@
 
     groups = recover(Path("file-000.parquet"), sample, Path("mended.parquet"))
 
-The row groups of such a file are whole: pyarrow writes each as it is closed, and only the table of
-where they lie is missing. That table is rebuilt by walking the pages' own headers, with the schema
-as the guide to how many values each column has, and written behind the row groups. A last row group
-that is not whole is left out. What comes back is not trusted: the caller reads and verifies every
-row of it.
+The row groups of such a file are whole: pyarrow writes each one when it is closed, and only the
+table of their positions is missing. That table is rebuilt by walking the pages' own headers; the
+schema gives the number of values per row in each column. It is written after the row groups. An
+incomplete last row group is dropped. The result is not trusted: the caller reads and verifies every
+row.
 """
 
 import io
@@ -39,7 +39,7 @@ class PageType(IntEnum):
 
 
 VALUE_COUNTS = {PageType.DATA: 5, PageType.DICTIONARY: 7, PageType.DATA_V2: 8}
-"""Type of a page → the field of PageHeader whose first field is the number of values."""
+"""Page type → the field of PageHeader whose first field is the number of values."""
 
 
 class File(IntEnum):
@@ -95,11 +95,11 @@ class Writing:
 
 
 LEROBOT = Writing("snappy", True)
-"""As LeRobot's writer does (lerobot 0.6.1, datasets/dataset_writer.py)."""
+"""How LeRobot's writer writes (lerobot 0.6.1, datasets/dataset_writer.py)."""
 
 
 class _Page(NamedTuple):
-    """A page: where it begins and ends, its type, number of values and decompressed bytes."""
+    """A page: its start and end, type, number of values and decompressed size in bytes."""
 
     start: int
     end: int
@@ -109,7 +109,7 @@ class _Page(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """A column of a row group: its pages, one behind the other."""
+    """A column of a row group: its consecutive pages."""
 
     pages: list[_Page]
 
@@ -123,9 +123,9 @@ def recover(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) 
 
     Args:
         path: the broken file.
-        sample: one row of the schema it was written with, its lists of their full lengths.
-        to: the file to write; it is not written when nothing can be kept.
-        writing: how it was written.
+        sample: one row in the schema the file was written with; its lists have full length.
+        to: the file to write; not written if nothing can be kept.
+        writing: how the broken file was written.
     """
     buffer = io.BytesIO()
     pq.write_table(
@@ -163,10 +163,10 @@ def recover(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) 
 
 
 def open_or_recover(file: Path, files: LeRobotFiles, scratch: Path) -> pq.ParquetFile:
-    """Open a data file of a dataset, or what can be recovered of it, written into `scratch`.
+    """Open a data file of a dataset, or a copy of its recoverable part, written into `scratch`.
 
     Raises:
-        ValueError: not one row group can be recovered.
+        ValueError: no row group can be recovered.
     """
     try:
         return pq.ParquetFile(file)
@@ -184,7 +184,7 @@ def open_or_recover(file: Path, files: LeRobotFiles, scratch: Path) -> pq.Parque
 
 
 def _sample(files: LeRobotFiles) -> pa.Table:
-    """Return a table of one row in the schema of a dataset's data files."""
+    """Return a table with one row in the schema of a dataset's data files."""
     columns = {}
     for field in files.schema:
         shape = files.features.get(field.name, {"shape": (1,)})["shape"]
@@ -193,7 +193,7 @@ def _sample(files: LeRobotFiles) -> pa.Table:
 
 
 def _example(kind: pa.DataType, shape: tuple[int, ...]) -> object:
-    """Return a value of an Arrow type, lists of the feature's length."""
+    """Return a value of an Arrow type; lists have the feature's shape."""
     if pa.types.is_struct(kind):
         return {"bytes": b"x", "path": "x"}
     if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
@@ -204,13 +204,13 @@ def _example(kind: pa.DataType, shape: tuple[int, ...]) -> object:
 
 
 def _footer(content: bytes) -> Fields:
-    """Return the FileMetaData of a whole parquet file."""
+    """Return the FileMetaData of a complete parquet file."""
     length = int.from_bytes(content[-8:-4], "little")
     return read_struct(content, len(content) - 8 - length)[0]
 
 
 def _groups(content: Content, leaves: list[Fields]) -> Iterator[list[_Column]]:
-    """Yield the whole row groups from the beginning of the file, each as its columns."""
+    """Yield the whole row groups from the beginning of the file, each as a list of columns."""
     position = len(MAGIC)
     while True:
         group = _next_group(content, position, leaves)
@@ -221,10 +221,10 @@ def _groups(content: Content, leaves: list[Fields]) -> Iterator[list[_Column]]:
 
 
 def _next_group(content: Content, position: int, leaves: list[Fields]) -> list[_Column] | None:
-    """Return the row group at `position`, or None where there is no whole one.
+    """Return the row group at `position`, or None if there is no whole one.
 
-    Nothing says how many rows it has or where its first column ends; so the first column is taken
-    with one page, with two, …, until every other column comes to the same number of rows.
+    The number of rows and the end of the first column are not recorded. So the first column is
+    tried with one page, with two, …, until all other columns have the same number of rows.
     """
     first: list[_Page] = []
     for page in _pages(content, position):
@@ -244,7 +244,7 @@ def _next_group(content: Content, position: int, leaves: list[Fields]) -> list[_
 def _others(
     content: Content, position: int, leaves: list[Fields], rows: int
 ) -> list[_Column] | None:
-    """Return the columns behind the first of a row group, None if they do not have `rows` rows."""
+    """Return a row group's columns after the first, or None if they do not have `rows` rows."""
     chunks = []
     for leaf in leaves:
         chunk = _chunk(content, position, leaf, rows * leaf[Meta.VALUES][1])
@@ -256,7 +256,7 @@ def _others(
 
 
 def _chunk(content: Content, position: int, leaf: Fields, values: int) -> _Column | None:
-    """Return the column of `values` values at `position`, or None where there is none."""
+    """Return the column of `values` values at `position`, or None if there is none."""
     pages: list[_Page] = []
     left = values
     for page in _pages(content, position):
@@ -271,7 +271,7 @@ def _chunk(content: Content, position: int, leaf: Fields, values: int) -> _Colum
 
 
 def _pages(content: Content, position: int) -> Iterator[_Page]:
-    """Yield the pages from `position` on, as long as they are whole."""
+    """Yield the pages from `position` on, as long as they are complete."""
     for _ in itertools.count():
         try:
             header, body = read_struct(content, position)
@@ -286,7 +286,7 @@ def _pages(content: Content, position: int) -> Iterator[_Page]:
 
 
 def _group(model: Fields, chunks: list[_Column], rows: int, number: int) -> Fields:
-    """Return the RowGroup of the footer for `chunks`, made like that of the sample."""
+    """Return the footer's RowGroup for `chunks`, modelled on that of the sample."""
     tables = []
     for example, chunk in zip(model[Group.COLUMNS][1][1], chunks, strict=True):
         meta = {key: value for key, value in example[Chunk.META][1].items() if key not in HINTS}

@@ -4,9 +4,9 @@
     repair_dataset(Path("dataset"), Path("mended"))     # the original stays as it is
 
 A killed LeRobot writer leaves data files without footers, no `meta/episodes` and an `info.json`
-that counts what is not there. The episodes that can be verified from the first on (`verify`) are
-written into a new folder with new metadata and statistics, which appears whole and is checked
-before it takes the old one's place.
+that counts missing episodes. The episodes that can be verified, starting from the first (`verify`),
+are written into a new folder with new metadata and statistics. This folder appears only when it is
+complete, and is checked before it replaces the old one.
 """
 
 import ctypes
@@ -39,20 +39,20 @@ from surgicai_vision.dataset.writer import DataFiles
 EXCHANGE = 2
 """RENAME_EXCHANGE of renameat2(2): swap two names in one step."""
 HERE = -100
-"""AT_FDCWD."""
+"""AT_FDCWD: paths are relative to the working directory."""
 
 
 @dataclass(frozen=True)
 class Repair:
-    """What a repair did.
+    """The result of a repair.
 
     Attributes:
         path: the whole dataset.
         episodes: episodes kept.
         frames: frames kept.
-        claimed: episodes the broken dataset said it had.
-        original: where the broken dataset is; None when nothing was broken.
-        problems: what was wrong, one line each.
+        claimed: number of episodes according to the broken dataset's `info.json`.
+        original: where the broken dataset is; None if nothing was broken.
+        problems: the problems found, one line each.
     """
 
     path: Path
@@ -66,16 +66,17 @@ class Repair:
 def repair_dataset(path: Path, out: Path | None = None, progress: Progress = silent) -> Repair:
     """Write the longest verified prefix of a dataset.
 
-    A dataset with nothing wrong is left alone, and `out` is not made.
+    A dataset without problems is left alone, and `out` is not created.
 
     Args:
         path: a LeRobot v3 dataset.
-        out: folder to make; by default `path` itself, whose original becomes `<path>.broken`.
+        out: folder to create; by default `path` is replaced and the original becomes
+            `<path>.broken`.
         progress: called with (episodes verified, episodes claimed, "episodes").
 
     Raises:
-        BadFile: no LeRobot dataset, or not one whole episode in it.
-        OutputExists: `out` holds something.
+        BadFile: `path` is not a LeRobot dataset, or contains no whole episode.
+        OutputExists: `out` is not empty.
     """
     before = _checked(path)
     files = LeRobotFiles(path)
@@ -85,7 +86,7 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress = sil
     if out is not None:
         check_output(out)
     elif _free(path, "broken") is None:
-        raise BadFile(f"100 broken datasets already lie next to {path}; give --out DIR.")
+        raise BadFile(f"100 broken datasets already exist next to {path}; give --out DIR.")
     work = work_folder(out or path)
     try:
         with claim(work):
@@ -105,7 +106,7 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress = sil
 
 
 def _checked(path: Path) -> CheckReport | None:
-    """Check a dataset; None where it cannot even be opened."""
+    """Check a dataset; return None if it cannot even be opened."""
     try:
         return check_dataset(path)
     except BadFile:
@@ -162,7 +163,7 @@ def _texts(tasks: Mapping[int, str], rows: Sequence[EpisodeMetadata]) -> list[st
 def _meta(
     ours: Table, rows: Sequence[EpisodeMetadata], digests: Sequence[str], claimed: int
 ) -> Table:
-    """Return `meta/surgicai.json` of the prefix; it is the result of no request any more."""
+    """Return `meta/surgicai.json` of the prefix, which is no longer the result of a request."""
     return {
         **ours,
         "request": None,
@@ -178,7 +179,7 @@ def _why(problems: Sequence[str]) -> str:
 
 
 def _free(path: Path, ending: str) -> Path | None:
-    """Return a name beside `path` that is not taken."""
+    """Return an unused name next to `path`."""
     tried = [path.with_name(f"{path.name}.{ending}{number or ''}") for number in range(100)]
     return next((name for name in tried if not name.exists()), None)
 
@@ -195,7 +196,7 @@ def _commit(made: Path, path: Path, out: Path | None) -> Path:
     assert original is not None
     os.rename(made, original)
     if not _exchange(original, path):
-        # Not on this file system: the two steps leave, between them, both folders whole under other
+        # This file system cannot exchange: between the renames, both folders are whole, under other
         # names.
         aside = _free(path, "repaired")
         assert aside is not None

@@ -1,11 +1,10 @@
-"""Thrift's compact protocol, as much of it as parquet's footers and page headers need.
+"""Thrift's compact protocol, as far as parquet's footers and page headers need it.
 
     fields, end = read_struct(content, start)        # {field id: (type, value)}
     content = write_struct(fields)
 
 A struct is a table of field id → (type, value); a list is (element type, [values]). Reading checks
-every length against the content, so foreign bytes end in a `ValueError` and never in a hang or an
-overrun.
+every length against the content, so foreign bytes cause a `ValueError`, never a hang or an overrun.
 """
 
 import mmap
@@ -19,14 +18,14 @@ Content = bytes | mmap.mmap
 Fields = dict[int, tuple[int, Any]]
 
 DEEPEST: Final = 32
-"""Nesting of structs and lists; parquet's footer has 6."""
+"""Maximum nesting of structs and lists; parquet's footer has 6 levels."""
 
 
 def read_struct(content: Content, position: int, depth: int = 0) -> tuple[Fields, int]:
     """Read the struct at `position`; return its fields and the position after it.
 
     Raises:
-        ValueError: the bytes are no struct.
+        ValueError: the bytes are not a struct.
     """
     fields: Fields = {}
     last = 0
@@ -53,7 +52,7 @@ def _field(content: Content, position: int, kind: int, depth: int) -> tuple[tupl
 def _value(content: Content, position: int, kind: int, depth: int) -> tuple[Any, int]:
     """Read one value of type `kind`."""
     if depth > DEEPEST:
-        raise ValueError("nested too deep")
+        raise ValueError("nested too deeply")
     if kind in (TRUE, FALSE, BYTE):
         return _byte(content, position)
     if kind in (I16, I32, I64):

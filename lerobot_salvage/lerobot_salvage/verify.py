@@ -1,12 +1,12 @@
-"""Verify a LeRobot dataset episode by episode, up to the first that is not whole.
+"""Verify a LeRobot dataset episode by episode, up to the first one that is not whole.
 
     verifier = Verifier(LeRobotFiles(path))
     for episode in verifier.episodes(scratch): …        # whole ones, in order
     verifier.files.problems                             # why it ended
 
-An episode is whole if its rows are in order and finite, every image decodes to the size its feature
-says, and every video has its frames; an episode that surgicai-vision rendered must also pass the
-rules of that package (`surgicai_vision.dataset.rules`).
+An episode is whole if its rows are in order and finite, every image decodes to the size given by
+its feature, and every video contains the episode's frames. An episode that surgicai-vision rendered
+must also pass the rules of that package (`surgicai_vision.dataset.rules`).
 """
 
 import functools
@@ -40,8 +40,8 @@ class Verified:
         table: its rows, with every image's bytes.
         statistics: its statistics by feature.
         tasks: sentences of its tasks.
-        videos: feature → (file's number, first second, second after the last).
-        digest: of the content, where surgicai-vision rendered it.
+        videos: feature → (file number, start [s], end [s]).
+        digest: digest of the content, if surgicai-vision rendered it; else "".
     """
 
     table: pa.Table
@@ -52,15 +52,15 @@ class Verified:
 
 
 class _Unfit(Exception):
-    """Why an episode is not whole."""
+    """The reason why an episode is not whole."""
 
 
 class Verifier:
     """Verifies the episodes of a dataset in order.
 
     Attributes:
-        files: the dataset's files; what ends the episodes is added to its problems.
-        ours: content of `meta/surgicai.json`, empty in a dataset of others.
+        files: the dataset's files; the reason why the episodes end is added to its problems.
+        ours: content of `meta/surgicai.json`; empty for datasets from other sources.
         video_files: feature → its videos.
     """
 
@@ -75,7 +75,7 @@ class Verifier:
         self._ends = dict.fromkeys(files.video_keys, (0, 0))
 
     def episodes(self, scratch: Path) -> Iterator[Verified]:
-        """Yield the whole episodes from the first on; `scratch` takes recovered files."""
+        """Yield the whole episodes from the first on; recovered files go into `scratch`."""
         open_file = functools.partial(open_or_recover, files=self.files, scratch=scratch)
         start = 0
         for number, table in enumerate(self.files.episodes(open_file)):
@@ -128,7 +128,7 @@ class Verifier:
         return tuple(self.files.features.get(key, {"shape": (1,)})["shape"])
 
     def _digested(self) -> list[str]:
-        """Return the image columns of a dataset of ours, in the order of its digest."""
+        """Return the image columns of one of our datasets, in the order of its digest."""
         if not self.ours:
             return []
         options = (self.ours["views"], self.ours["depth"], self.ours["segmentation"])
@@ -157,7 +157,7 @@ class Verifier:
         rows = self.files.rows
         if number < len(rows) and rows[number].get("length") != count:
             raise _Unfit(
-                f"it has {count} frames, and {rows[number].get('length')} in meta/episodes."
+                f"it has {count} frames, but {rows[number].get('length')} in meta/episodes."
             )
 
     def _images(
@@ -167,7 +167,7 @@ class Verifier:
         columns: Mapping[str, NDArray[np.generic]],
         digest: schema.EpisodeDigest,
     ) -> tuple[pa.Table, Statistics]:
-        """Verify one image column; return the table with the bytes of images that lay beside it."""
+        """Verify one image column; return the table with the bytes of images stored as files."""
         watch = self._watch(key, columns, True)
         statistics = ImageStatistics()
         found = []
@@ -193,7 +193,7 @@ class Verifier:
     def _look(
         self, watch: ImageWatch | None, key: str, index: int, frame: NDArray[np.uint8 | np.float32]
     ) -> None:
-        """Refuse an image that a dataset of ours cannot hold."""
+        """Refuse an image that one of our datasets cannot contain."""
         problem = watch.problem(index, frame) if watch else ""
         if problem:
             raise _Unfit(f"frame {index} of {key}: {problem}.")
@@ -204,7 +204,7 @@ class Verifier:
             raise _Unfit(f"frame {index} of {key} is {frame.shape}, not {shape}.")
 
     def _beside(self, name: str | None) -> bytes:
-        """Read an image that lies as a file in the dataset."""
+        """Read an image that is stored as a separate file in the dataset."""
         path = (self.files.path / (name or "")).resolve()
         if not name or not path.is_relative_to(self.files.path.resolve()) or not path.is_file():
             raise _Unfit(f"the image {name or '(no name)'} is missing.")
@@ -225,7 +225,7 @@ class Verifier:
         path = self.video_files[key][file]
         self._ends[key] = (file, first + count)
         if (self.files.features[key].get("info") or {}).get("is_depth_map"):
-            # Quantised depth is LeRobot's to decode; here its frames are counted.
+            # Only LeRobot decodes quantised depth; here its frames are just counted.
             held = self._length(path)
             if held < first + count:
                 raise _Unfit(f"{path.name} of {key} has {held} frames; it needs {first + count}.")
@@ -243,7 +243,7 @@ class Verifier:
     def _place(self, key: str, number: int, count: int) -> tuple[int, int]:
         """Return (file, first frame) of an episode in a feature's videos.
 
-        Its row says where it is; without a row the episodes follow one another.
+        Its row says where it is; without a row, it starts where the previous episode ended.
         """
         files = self.video_files[key]
         row = self.files.rows[number] if number < len(self.files.rows) else {}
@@ -259,7 +259,7 @@ class Verifier:
             file += 1
             first = 0
         if file >= len(files) or self._length(files[file]) < first + count:
-            raise _Unfit(f"the videos of {key} end before it.")
+            raise _Unfit(f"the videos of {key} do not contain all its frames.")
         return file, first
 
     def _length(self, path: Path) -> int:
@@ -269,7 +269,7 @@ class Verifier:
 
 
 def _ours(path: Path) -> Table:
-    """Return `meta/surgicai.json`, empty where there is none that can be read."""
+    """Return the content of `meta/surgicai.json`; empty if it cannot be read."""
     try:
         meta = read_json(path / names.META_FILE)
         return meta if {"views", "depth", "segmentation", "image_size"} <= set(meta) else {}
@@ -301,6 +301,6 @@ def _array(column: pa.ChunkedArray, features: Features, key: str) -> NDArray[np.
 
 
 def _statistics(values: NDArray[np.generic], shape: tuple[int, ...]) -> Statistics:
-    """Return a column's statistics over all axes but the last, as LeRobot's."""
+    """Return a column's statistics over all axes but the last, as LeRobot does."""
     table = column_statistics(values.reshape(-1, shape[-1]))
     return {**table, "count": [len(values)]}

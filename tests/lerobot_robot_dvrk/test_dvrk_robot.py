@@ -321,7 +321,7 @@ def test_an_emergency_stop_holds_the_arm_and_the_log_says_why(robot, command, ca
 
 
 def test_a_robot_needs_its_workspace_and_a_person_that_holds_it():
-    with pytest.raises(InputError, match="a person holds a robot"):
+    with pytest.raises(InputError, match="a real robot needs a dead-man's switch: dead_man"):
         DvrkConfig()
     with pytest.raises(InputError, match="where this robot's tips may be"):
         DvrkConfig(dead_man="/pedal")
