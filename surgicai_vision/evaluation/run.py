@@ -8,7 +8,7 @@ from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.files import code_version
 from surgicai_vision.core.progress import Progress, Stage
 from surgicai_vision.evaluation.films import Filming
-from surgicai_vision.evaluation.finished import FinishedEpisodes
+from surgicai_vision.evaluation.finished import FOLDER, FinishedEpisodes
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.rollout import check_seeds, evaluate
@@ -69,7 +69,7 @@ def evaluate_into(
         finished = None
         if spec.resumes:
             owner = [to_mapping(run), dict(spec.about), scene_hash, code_version(), repr(filming)]
-            finished = FinishedEpisodes.open(out, digest(owner))
+            finished = FinishedEpisodes(out / FOLDER, digest(owner))
         episodes = evaluate(
             spec.make_agent,
             spec.config,

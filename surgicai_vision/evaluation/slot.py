@@ -181,7 +181,7 @@ class Slot:
         row = EpisodeMetrics(
             task=self.task_config.task,
             policy=self.agent.name,
-            seed=self.seed,
+            seed=int(self.seed),
             success=success,
             steps=self.steps,
             trajectory_length_mm=1e3 * float(self.info.get("tip_path", 0.0)),
@@ -202,7 +202,7 @@ class Slot:
             slip_deg=math.degrees(monitor.turn),
             tissue_force_n=monitor.tissue_force,
             tissue_impulse_ns=monitor.tissue_impulse,
-            tears=float(monitor.tears),
+            tears=monitor.tears,
             thread_mm=1e3 * monitor.thread_drawn,
             paper_success=monitor.paper_success and not self.error,
             upset=self._mishap.kind,

@@ -4,6 +4,7 @@ import functools
 from dataclasses import replace
 
 import pytest
+from safetensors.numpy import load, save
 
 from surgicai_vision.evaluation import finished
 from surgicai_vision.evaluation.agents import ZeroAgent
@@ -77,7 +78,8 @@ def test_what_is_damaged_or_of_something_else_runs_again(tmp_path, monkeypatch, 
         path = tmp_path / finished.FOLDER / f"{min(kept)}{finished.SUFFIX}"
         path.write_bytes(path.read_bytes()[:-100])
     elif broken == "owner":
-        (tmp_path / finished.FOLDER / finished.OWNER).write_text("{")
+        for path in (tmp_path / finished.FOLDER).iterdir():
+            path.write_bytes(save(load(path.read_bytes())))  # without any metadata
     elif broken == "other policy":
         spec = replace(spec, about={"checkpoint": {"policy_sha256": "0"}})
     else:
