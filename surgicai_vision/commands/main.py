@@ -24,7 +24,9 @@ from cyclopts.exceptions import (
     UnknownOptionError,
     UnusedCliTokensError,
 )
-from rich.console import Console
+from cyclopts.help import DefaultFormatter, HelpPanel, InlineText
+from rich.console import Console, ConsoleOptions
+from rich.text import Text
 
 from surgicai_vision.commands import COMMANDS, PROGRAM, register
 from surgicai_vision.commands.options import from_file, split_comma_lists
@@ -41,12 +43,26 @@ TERMINATED = 128 + signal.SIGTERM
 """Exit code after SIGTERM, as a shell reports it."""
 EVERYWHERE = Group("Options of every command", sort_key=1)
 
+
+class OneParagraph(DefaultFormatter):
+    """Help panels whose texts wrap at the edge of the window, not where their docstrings do."""
+
+    def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
+        """Print a panel, with each description's lines joined."""
+        for entry in panel.entries:
+            match entry.description:
+                case InlineText(primary_renderable=Text() as text):
+                    text.plain = " ".join(text.plain.split())
+        super().__call__(console, options, panel)
+
+
 app = App(
     name=PROGRAM,
     help=TITLE,
     version=lambda: f"{PROGRAM} {version(PROGRAM)}",
     default_parameter=Parameter(negative_iterable=(), show_env_var=False),
     help_format="plaintext",
+    help_formatter=OneParagraph(),
     console=Console(soft_wrap=True),  # examples are not wrapped at the edge of the window
     result_action="return_value",
     print_error=False,
