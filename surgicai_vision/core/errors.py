@@ -21,6 +21,15 @@ class SurgicaiError(Exception):
 
     exit_code = 1
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle the message: a subclass may build it from other arguments."""
+        return _with_message, (type(self), self.args), self.__dict__
+
+
+def _with_message(kind: type[SurgicaiError], arguments: tuple[object, ...]) -> SurgicaiError:
+    """Return an error as it was pickled; `__new__` keeps the arguments, `__init__` is not called."""
+    return kind.__new__(kind, *arguments)
+
 
 class InputError(SurgicaiError):
     """Input that cannot be used. Exit code 2."""

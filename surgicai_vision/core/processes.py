@@ -353,13 +353,17 @@ def _serve_calls(connection: Connection) -> None:
         message: Done | Failure
         try:
             function, arguments, reports = connection.recv()
-            more = {"report": _sender(connection)} if reports else {}
-            message = Done(function(*arguments, **more))
-        except (EOFError, BrokenPipeError, ConnectionResetError):
+        except (EOFError, ConnectionResetError):
             return
+        more = {"report": _sender(connection)} if reports else {}
+        try:
+            message = Done(function(*arguments, **more))
         except Exception as error:
             message = Failure.of(error)
-        connection.send(message)
+        try:
+            connection.send(message)
+        except (BrokenPipeError, ConnectionResetError):
+            return
 
 
 def _sender(connection: Connection) -> Report:
@@ -390,8 +394,7 @@ def run_all(
         variables: environment variables of the workers.
 
     Raises:
-        SurgicaiError: a call failed; the others are ended.
-        Died: a worker died; the others are ended.
+        SurgicaiError: a call failed or a worker died; the others are ended.
     """
     reported = [0] * len(calls)
     results: dict[int, T] = {}
@@ -413,6 +416,11 @@ def run_all(
             hear(reported)
         for worker in workers:
             worker.dismiss()
+    except Died as death:
+        raise SurgicaiError(
+            f"A process of {what} was killed (exit code {death.exit_code}; out of memory?); "
+            "run it again with --workers 1."
+        ) from None
     finally:
         for worker in workers:
             worker.end()

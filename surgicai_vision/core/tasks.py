@@ -131,21 +131,28 @@ def register_ids() -> None:
 
 
 class _GymnasiumFinder(MetaPathFinder):
-    """Finds gymnasium once, as Python does, and registers the ids when it has been imported."""
+    """Finds gymnasium as Python does, and registers the ids when it has been imported."""
+
+    def __init__(self) -> None:
+        self._is_asking = False
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         """Return the spec of gymnasium; None for every other module."""
-        if fullname != "gymnasium":
+        if fullname != "gymnasium" or self._is_asking:
             return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(fullname)
+        self._is_asking = True
+        try:
+            spec = importlib.util.find_spec(fullname)
+        finally:
+            self._is_asking = False
         if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
 
             def execute_and_register(module: ModuleType) -> None:
                 execute(module)
+                sys.meta_path.remove(self)
                 _register_all()
 
             spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]

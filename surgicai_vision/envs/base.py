@@ -34,6 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, SuccessRule, TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError, check_name, shown
+from surgicai_vision.core.generators import generator_of, generator_state
 from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.core.tasks import TASKS, task_text
 from surgicai_vision.envs import absolute, hole_crossing, observation, poses, randomisation
@@ -186,7 +187,7 @@ class SuturingEnv(gymnasium.Env):
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
         """Take one 20 ms control step, or up to `action_repeat` of them until the episode ends."""
         if self.config.hold_jaw and self.subtask.starts_held:
-            action = np.array([*np.asarray(action).ravel()[:6], 0.0], np.float32)
+            action = np.array([*self._checked(action)[:6], 0.0], np.float32)
         for _ in range(self.config.action_repeat - 1):
             before = self._control_step(action)
             if before[2] or before[3]:
@@ -361,13 +362,13 @@ class SuturingEnv(gymnasium.Env):
     @property
     def snapshot(self) -> tuple[NDArray[np.float64], dict[str, object]]:
         """The whole state and that of the generator that draws the next starts; settable."""
-        return self.get_state(), dict(self.np_random.bit_generator.state)
+        return self.get_state(), generator_state(self.np_random)
 
     @snapshot.setter
     def snapshot(self, snapshot: tuple[NDArray[np.float64], dict[str, object]]) -> None:
         state, generator = snapshot
         self.set_state_vector(state)
-        self.np_random.bit_generator.state = generator
+        self.np_random = generator_of(generator)
 
     def set_state_vector(self, state: NDArray[np.float64]) -> None:
         """Restore a state from `get_state`: the episode continues from it exactly as it did."""
@@ -547,12 +548,9 @@ class SuturingEnv(gymnasium.Env):
         return [-1.0 if value < -1.0 else 1.0 if value > 1.0 else value for value in values]
 
     def _meet_draws(self) -> None:
-        """Adapt to new draws: goals move with the phantom, the renderer redraws the needle."""
+        """Adapt to new draws: goals move with the phantom and depend on the needle's shape."""
         simulation = self.simulation
-        axes = self.config.randomisation
         self.stitch = Stitch.of(simulation.pair, simulation.radius, simulation.tip_angle)
-        if axes.needle_thickness or axes.needle_size or axes.needle_arc:
-            self._images.close()
 
     def _remember_tool(self) -> None:
         """Start measuring the active tip's path at its present position."""

@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.cameras import other_cameras
 from surgicai_vision.core.config import ANY, NEEDLE_ARCS, RANDOMISATION_LIMITS, RandomisationConfig
 from surgicai_vision.core.errors import InputError, check_name, shown
 from surgicai_vision.envs import looks
 from surgicai_vision.envs.placement import SLIDE, Placement
 from surgicai_vision.scene import Scene, needle
-from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.needle import NeedleShape
 from surgicai_vision.scene.reshape import reshape_needle
@@ -241,7 +239,7 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
     turns = numbers["camera_turn"].reshape(-1, 3)
     for cameras, shift, turn, fovy in zip(RIGS, shifts, turns, numbers["camera_fovy"], strict=True):
         _aim(source, model, cameras, shift, turn, fovy)
-    for name in filter(_stands, other_cameras()):
+    for name in scene.other_cameras:
         _aim(source, model, (name,), shifts[0], turns[0], numbers["camera_fovy"][0])
     appearance.carry_spot(model)
     model.geom_friction[:] = source.geom_friction * (1.0 + float(numbers["friction"][0]))
@@ -267,11 +265,6 @@ def _place_phantom(scene: Scene, model: mujoco.MjModel, where: Placement) -> Non
         model.body_pos[body] = source.body_pos[body] + pose[:3, 3]
         model.body_quat[body] = matrix_to_quaternion(pose[:3, :3])
     show_ink(model, scene.ink_geoms, where.pair)
-
-
-def _stands(name: str) -> bool:
-    """Return True for a camera of the scene, False for a crop."""
-    return crop_of(name) is None
 
 
 def _light(model: mujoco.MjModel, factors: Array) -> None:

@@ -38,6 +38,7 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
 
 SUBSTEPS = 10
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_USER_DATA = int(mujoco.mjtState.mjSTATE_USERDATA)
 CLOCK_START = 1.0
 """Time at the start of an episode [s]: not 0, so that MuJoCo's own reset to 0 is noticed."""
 _SET_SEVEN = struct.Struct("7d").pack_into
@@ -211,7 +212,10 @@ class Simulation:
         _SET_SEVEN(self._ctrl, self._servos[arm], *joints, control.jaw_servo(command.jaw))
 
     def pose_needle(self, pose: Pose) -> None:
-        """Put the needle at a pose in world, at rest; embedded if that is in soft tissue."""
+        """Put the needle at a pose in world; embedded if that is in soft tissue.
+
+        Its velocity stays as it is.
+        """
         free = self.scene.needle_qpos.start
         self.data.qpos[free : free + 3] = poses.position(pose)
         turn = matrix_to_quaternion_flat(poses.rotation(pose))
@@ -541,15 +545,17 @@ class Simulation:
             )
         if not np.isfinite(vector).all():
             raise InputError("The state holds numbers that are not finite.")
+        userdata = np.empty(self.model.nuserdata)
+        mujoco.mj_extractState(self.model, vector, STATE, userdata, _USER_DATA)
+        values = userdata.tolist()
+        draws = tuple(values[_DRAWS:_WELDS])
+        if draws != self.draws:
+            self.randomise(draws)
         mujoco.mj_setState(self.model, self.data, vector, STATE)
-        values = self.data.userdata.tolist()
         self.task_state = TaskState.unpack(values)
         for index, arm in enumerate(names.ARMS):
             start = _COMMANDS + COMMAND_SIZE * index
             self.commands[arm] = Command.unpack(values[start : start + COMMAND_SIZE])
-        draws = tuple(values[_DRAWS:_WELDS])
-        if draws != self.draws:
-            self.randomise(draws)
         if self._welds:
             self._welds.unpack(values[_WELDS:_QUEUE])
         if self.tissue:

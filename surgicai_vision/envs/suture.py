@@ -29,39 +29,51 @@ PULLOUT_PHASE = 4
 class Suture(SuturingEnv):
     """All five subtasks in a row; `is_success` is the whole procedure's."""
 
+    def measure(self) -> Info:
+        """Return the info dict of the present, measured state."""
+        return self._of_procedure(super().measure())
+
+    def _of_procedure(self, info: Info) -> Info:
+        """Return the present subtask's measurement as the whole procedure's; store nothing."""
+        info["subtask_success"] = info["is_success"]
+        state = self.simulation.task_state
+        if self.config.advance == "told":
+            whole = self.judge(PULLOUT_PHASE)
+            info["progress"] = self._solved(whole)
+            info["is_success"] = whole.full
+            info["paper_success"] = whole.paper
+            return info
+        is_next = info["is_success"] and state.phase == state.done
+        info["progress"] = state.done + 1 if is_next else state.done
+        info["is_success"] = self._is_last and info["is_success"]
+        info["paper_success"] = self._is_last and info["paper_success"]
+        return info
+
+    def _solved(self, whole: Verdict) -> int:
+        """Return how many subtasks are solved by now, whichever one is active.
+
+        Args:
+            whole: whether the pull-out, and with it the whole procedure, is solved.
+        """
+        done = self.simulation.task_state.done
+        if whole.full:
+            return len(self._subtasks)
+        if done <= INSERT_PHASE and self.judge(INSERT_PHASE).full:
+            return INSERT_PHASE + 1
+        if done < PULLOUT_PHASE and self.judge(done).full:
+            return done + 1
+        return done
+
     def _progress(self, info: Info) -> bool:
         """Advance to the next subtask once the present one's success has held; return if it did."""
-        if self.config.advance == "told":
-            self._count(info)
-            return False
         state = self.simulation.task_state
-        info["subtask_success"] = info["is_success"]
-        dwell = self._count_dwell(info["paper_success"])
-        is_last = state.phase == len(self._subtasks) - 1
-        if info["is_success"] and state.phase == state.done:
-            state.done += 1
-        info["progress"] = state.done
-        info["is_success"] = is_last and info["is_success"]
-        info["paper_success"] = is_last and info["paper_success"]
-        if is_last or dwell < DWELL:
+        is_told = self.config.advance == "told"
+        dwell = 0 if is_told else self._count_dwell(info["paper_success"])
+        state.done = self._of_procedure(info)["progress"]
+        if is_told or self._is_last or dwell < DWELL:
             return False
         self._make_present(state.phase + 1)
         return True
-
-    def _count(self, info: Info) -> None:
-        """Count the subtasks that are solved, whichever one is active."""
-        state = self.simulation.task_state
-        info["subtask_success"] = info["is_success"]
-        whole = self.judge(PULLOUT_PHASE)
-        if whole.full:
-            state.done = len(self._subtasks)
-        elif state.done <= INSERT_PHASE and self.judge(INSERT_PHASE).full:
-            state.done = INSERT_PHASE + 1
-        elif state.done < PULLOUT_PHASE and self.judge(state.done).full:
-            state.done += 1
-        info["progress"] = state.done
-        info["is_success"] = whole.full
-        info["paper_success"] = whole.paper
 
     def judge(self, phase: int) -> Verdict:
         """Return whether a subtask is solved now, whichever one is active (`envs.success.judge`).
@@ -74,7 +86,11 @@ class Suture(SuturingEnv):
 
     def _meets_demands(self) -> bool:
         """Return True only in the last subtask, whose success is that of the whole procedure."""
-        return self.phase == len(self._subtasks) - 1 and super()._meets_demands()
+        return self._is_last and super()._meets_demands()
+
+    @property
+    def _is_last(self) -> bool:
+        return self.phase == len(self._subtasks) - 1
 
     @property
     def dwell(self) -> int:

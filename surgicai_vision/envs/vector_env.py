@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.processes import Child
+from surgicai_vision.core.tasks import task_steps
 from surgicai_vision.envs import SuturingEnv, make_task, refuse_max_steps
 from surgicai_vision.envs.success import Info
 
@@ -48,16 +49,22 @@ def make_vector(
         num_envs: number of envs.
         workers: worker processes, at most as many as envs; 0 steps all envs in this process.
         autoreset_mode: gymnasium's: "NextStep" (default), "SameStep" or "Disabled".
-        max_episode_steps: limit of an episode [control steps]; 0 takes the paper's.
-        **arguments: what `envs.make_task` takes.
+        max_episode_steps: limit of an episode [actions], as for `gymnasium.make`; 0 takes the
+            paper's.
+        **arguments: what `envs.make_task` takes, without `max_steps`.
     """
+    refuse_max_steps(arguments)
+    actions = max_episode_steps or task_steps(arguments["task"])
+    arguments["max_steps"] = actions * arguments.get("action_repeat", 1)
+    return vector_of(num_envs, workers, AutoresetMode(autoreset_mode), arguments)
+
+
+def vector_of(num_envs: int, workers: int, mode: AutoresetMode, arguments: Arguments) -> VectorEnv:
+    """Return a vector env of `make_task(**arguments)`; see `make_vector`."""
     if num_envs < 1 or workers < 0:
         raise InputError(
             f"num_envs is {num_envs}, workers is {workers}; allowed: at least 1, at least 0."
         )
-    refuse_max_steps(arguments)
-    arguments["max_steps"] = max_episode_steps
-    mode = AutoresetMode(autoreset_mode)
     if workers:
         return SuturingVectorEnv(num_envs, min(workers, num_envs), mode, arguments)
     return SyncVectorEnv([lambda: _make(arguments)] * num_envs, autoreset_mode=mode)
@@ -192,6 +199,9 @@ class SuturingVectorEnv(VectorEnv):
             raise SurgicaiError(
                 f"A worker of the vector env died (exit codes {codes}); make a new one."
             ) from error
+        except BaseException:
+            self.close()  # an answer may still be on its way: it is not that of the next request
+            raise
         for answer in answers:
             if isinstance(answer, _Failure):
                 self.close()

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 
 from surgicai_vision.core import processes
 from surgicai_vision.core.config import LARGEST_INTEGER, TaskConfig
-from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.evaluation.agent import MakeAgent
@@ -168,15 +168,9 @@ def _in_processes(
     shares: Sequence[Callable[..., list[Episode]]], report: Callable[[int], None]
 ) -> list[list[Episode]]:
     """Run each share in its own process."""
-    try:
-        return processes.run_all(
-            shares,
-            "the evaluation",
-            lambda done: report(sum(done)),
-            {"LP_NUM_THREADS": "0"},  # the agents keep torch to one thread
-        )
-    except processes.Died:
-        raise SurgicaiError(
-            "A process of the evaluation was killed (out of memory?); "
-            "run it again with --workers 1."
-        ) from None
+    return processes.run_all(
+        shares,
+        "the evaluation",
+        lambda done: report(sum(done)),
+        {"LP_NUM_THREADS": "0"},  # the agents keep torch to one thread
+    )

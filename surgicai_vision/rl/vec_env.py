@@ -28,7 +28,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.envs import OPTIONS, make_task
 from surgicai_vision.envs.success import Info
-from surgicai_vision.envs.vector_env import make_vector
+from surgicai_vision.envs.vector_env import vector_of
 
 LOCAL = ("compute_reward", "compute_terminated")
 """Methods that are functions of goals alone."""
@@ -51,13 +51,11 @@ class SuturingVecEnv(VecEnv):
         limit = arguments.pop("max_steps", 0)
         self._arguments = {"task": task, "max_steps": limit, **arguments}
         # a vector env of gymnasium declares neither `call` nor lists of seeds
-        self._vector: Any = make_vector(
+        self._vector: Any = vector_of(
             n_envs,
             workers,
             AutoresetMode.SAME_STEP,
-            max_episode_steps=limit,
-            task=task,
-            **arguments,
+            self._arguments,
         )
         self._local = make_task(**self._arguments)
         self._actions: NDArray[np.float32] = np.zeros((n_envs, 7), np.float32)

@@ -22,7 +22,7 @@ from surgicai_vision.core.cameras import other_cameras
 from surgicai_vision.core.config import SceneConfig
 from surgicai_vision.core.errors import UnknownName
 from surgicai_vision.scene import arm, holes, kinematics, needle, phantom, rotations, thread, tissue
-from surgicai_vision.scene.cameras import add_cameras
+from surgicai_vision.scene.cameras import add_cameras, crop_of
 from surgicai_vision.scene.visual import materials, skin
 
 TIMESTEP = 0.002
@@ -74,6 +74,7 @@ class Scene:
         needle_qpos: the needle's position and quaternion in qpos.
         needle_geoms: ids of the needle's capsules, from base to tip.
         ink_geoms: ids of the ink around each hole pair, if each has its own; else empty.
+        other_cameras: names of its cameras that are other distributions'.
     """
 
     model: mujoco.MjModel
@@ -86,6 +87,7 @@ class Scene:
     needle_qpos: slice
     needle_geoms: range
     ink_geoms: tuple[int, ...] = ()
+    other_cameras: tuple[str, ...] = ()
 
     def named(self, kind: str, name: str) -> int:
         """Return the id of a named body, joint, geom, site, camera, actuator or sensor.
@@ -137,6 +139,7 @@ def _build_scene(config: SceneConfig, others: tuple[str, ...]) -> Scene:
         needle_qpos=slice(free, free + 7),
         needle_geoms=range(first, first + needle.SEGMENTS),
         ink_geoms=skin.ink_geoms(model, config.layout) if config.ink == "due" else (),
+        other_cameras=tuple(name for name in others if crop_of(name) is None),
     )
 
 

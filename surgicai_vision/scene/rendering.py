@@ -28,6 +28,7 @@ from surgicai_vision.scene import opengl
 from surgicai_vision.scene.cameras import Window, camera_id, crop_of
 from surgicai_vision.scene.opengl import renderer_string
 from surgicai_vision.scene.orbit import Orbit
+from surgicai_vision.scene.reshape import MESH, needle_vertices
 from surgicai_vision.scene.visual import appearance
 
 __all__ = ["QUALITIES", "Frame", "FrameRenderer", "parts_of_geoms", "renderer_string"]
@@ -231,6 +232,8 @@ class _Target:
         self.codes = np.zeros(0, dtype=np.uint8)
         self.look = appearance.shown(model)
         self.painted = [0.0] * len(self.look)
+        self.needle = needle_vertices(model)
+        self.drawn_needle = self.needle.copy()
         self.versions: dict[int, int] = {}
 
     def draw(
@@ -252,6 +255,9 @@ class _Target:
             appearance.paint(self.model, self.context)
             self.painted = numbers
             self.codes = np.zeros(0, dtype=np.uint8)
+        if not np.array_equal(self.needle, self.drawn_needle):
+            mujoco.mjr_uploadMesh(self.model, self.context, self.model.mesh(MESH).id)
+            self.drawn_needle = self.needle.copy()
         if skin is not None:
             for mesh, version in zip(skin.meshes, skin.follow(), strict=True):
                 if self.versions.get(mesh) != version:

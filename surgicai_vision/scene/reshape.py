@@ -11,6 +11,7 @@ import math
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.needle import NeedleShape
@@ -18,6 +19,8 @@ from surgicai_vision.scene.visual import materials
 
 OF_GEOM = ("geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb")
 OF_BODY = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_sameframe")
+MESH = "needle"
+"""Name of the mesh that is drawn."""
 OF_MESH = ("mesh_pos", "mesh_quat")
 OF_VERTICES = ("mesh_vert", "mesh_normal")
 
@@ -52,6 +55,16 @@ def reshape_needle(source: mujoco.MjModel, model: mujoco.MjModel, shape: NeedleS
     _move_along(source, model, here, shape)
 
 
+def needle_vertices(model: mujoco.MjModel) -> NDArray[np.float32]:
+    """Return the vertices of the needle's drawn mesh as a view, (n, 3) [m]; none without one."""
+    mesh = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MESH, MESH)
+    if mesh < 0:
+        return np.zeros((0, 3), np.float32)
+    first = model.mesh_vertadr[mesh]
+    vertices: NDArray[np.float32] = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+    return vertices
+
+
 def _copy_geoms(alone: mujoco.MjModel, there: int, model: mujoco.MjModel, here: int) -> None:
     """Copy the needle's geoms, and the tree of their bounds, from body `there` to body `here`."""
     number = alone.body_geomnum[there]
@@ -72,8 +85,8 @@ def _copy_geoms(alone: mujoco.MjModel, there: int, model: mujoco.MjModel, here: 
 
 def _copy_mesh(alone: mujoco.MjModel, model: mujoco.MjModel) -> None:
     """Copy the drawn mesh; it has the same number of vertices whatever the shape."""
-    there = alone.mesh("needle").id
-    here = model.mesh("needle").id
+    there = alone.mesh(MESH).id
+    here = model.mesh(MESH).id
     for name in OF_MESH:
         getattr(model, name)[here] = getattr(alone, name)[there]
     for name, kind in zip(OF_VERTICES, ("vert", "normal"), strict=True):

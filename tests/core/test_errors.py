@@ -1,16 +1,20 @@
 """Errors: what the checks accept, and that messages state the given and the allowed values."""
 
 import math
+import pickle
 
 import pytest
 
 from surgicai_vision.core.errors import (
     InputError,
+    SurgicaiError,
+    UnknownName,
     check_at_least,
     check_at_most,
     check_finite,
     check_positive,
 )
+from surgicai_vision.core.plugins import NameCollision
 
 
 def test_numbers_at_the_limit_and_no_number_pass():
@@ -35,3 +39,18 @@ def test_a_number_that_is_not_finite_is_named(number):
         check_finite(size=1.0, noise=number)
     with pytest.raises(InputError, match=f"^noise is {number}; it must be at most 9.$"):
         check_at_most(9, size=1, noise=number)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        SurgicaiError("It failed."),
+        UnknownName("camera", "frnt", ["front", "back"]),
+        NameCollision("task", "knot", "one", "other"),
+    ],
+)
+def test_an_error_crosses_processes(error):
+    error.add_note("where it happened")
+    copy = pickle.loads(pickle.dumps(error))
+    assert (type(copy), str(copy), copy.exit_code) == (type(error), str(error), error.exit_code)
+    assert copy.__notes__ == ["where it happened"]

@@ -14,7 +14,7 @@ import pytest
 
 from surgicai_vision.core import processes
 from surgicai_vision.core.errors import InputError, SurgicaiError
-from surgicai_vision.core.processes import Child, Died, run_all, run_module
+from surgicai_vision.core.processes import Child, run_all, run_module
 
 HELPERS = {"PYTHONPATH": str(Path(fake_calls.__file__).parent)}
 
@@ -48,8 +48,12 @@ def test_a_failure_ends_the_others_and_keeps_its_kind():
     ) as caught:
         run_all([long, fake_calls.crash], "counting", silent)
     assert "in crash" in caught.value.__notes__[0], "the traceback is not lost"
-    with pytest.raises(Died, match=r"exit code -9"):
+    with pytest.raises(
+        SurgicaiError, match=r"A process of dying was killed \(exit code -9; out of"
+    ):
         run_all([long, fake_calls.die], "dying", silent)
+    with pytest.raises(SurgicaiError, match="reading failed: EOFError: No data left in file"):
+        run_all([long, fake_calls.read_nothing], "reading", silent)
     assert time.monotonic() - began < 30
     assert not multiprocessing.active_children(), "none is left"
 

@@ -54,6 +54,10 @@ def test_ids_are_there_in_whatever_order_the_two_are_imported() -> None:
         code = f"import {first}, {second}, gymnasium as g; print(*g.registry)"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert {tasks.env_id(task) for task in names.TASKS} <= set(done.stdout.split())
+    asked = "import importlib.util as u, surgicai_vision; u.find_spec('gymnasium')"
+    code = f"{asked}; import gymnasium as g; print(*g.registry)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert {tasks.env_id(task) for task in names.TASKS} <= set(done.stdout.split())
     code = "import surgicai_vision, sys; print('gymnasium' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "False"

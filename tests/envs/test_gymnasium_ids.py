@@ -79,6 +79,19 @@ def test_an_episode_ends_at_the_limit_that_its_spec_says(limit):
     assert remade.spec.max_episode_steps == steps
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_episode_of_a_vector_env_has_as_many_actions(workers):
+    arguments = {"max_episode_steps": 6, "action_repeat": 2}
+    envs = gymnasium.make_vec(env_id("grasp"), 2, workers=workers, **arguments)
+    try:
+        envs.reset(seed=0)
+        actions = np.zeros((2, 7), np.float32)
+        ends = [envs.step(actions)[3].tolist() for _ in range(6)]
+    finally:
+        envs.close()
+    assert ends == [[False, False]] * 5 + [[True, True]]
+
+
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
 def test_two_limits_are_refused(make):
     with pytest.raises(InputError, match="max_episode_steps=7"):

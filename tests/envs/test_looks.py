@@ -132,6 +132,18 @@ def test_a_state_of_a_plain_episode_looks_plain_again():
     assert np.array_equal(image(env), image(plain))
 
 
+def test_a_new_renderer_draws_the_plain_look_after_another():
+    env = make(RandomisationConfig(appearance="train"))
+    other = make(RandomisationConfig(appearance="train"))
+    as_compiled = {"randomisation": {"appearance": [0.0, 0.0]}}
+    env.reset(seed=0)
+    other.reset(seed=0, options=as_compiled)
+    plain = other.image("front", (98, 98))
+    assert not np.array_equal(env.image("front", (96, 96)), other.image("front", (96, 96)))
+    env.reset(seed=0, options=as_compiled)
+    assert np.array_equal(env.image("front", (98, 98)), plain)
+
+
 def test_the_same_seed_looks_the_same_in_another_process():
     code = (
         "import hashlib, sys\n"

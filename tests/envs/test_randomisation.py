@@ -1,6 +1,7 @@
 """Randomisation: each axis changes what it should, from the seed alone, and is restored."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -160,8 +161,27 @@ def test_restored_elsewhere_it_looks_and_moves_the_same():
 def test_a_randomised_state_is_refused_by_an_env_without():
     changed, plain = made(friction=0.2), made()
     changed.reset(seed=0)
+    plain.reset(seed=1)
+    before = plain.get_state()
     with pytest.raises(InputError, match="randomisation"):
         plain.set_state_vector(changed.get_state())
+    np.testing.assert_array_equal(plain.get_state(), before)
+
+
+def test_a_snapshot_continues_with_the_same_episodes():
+    """In the same env, and in one that has drawn others; the snapshot may be stored as JSON."""
+    env = made(phantom_shift=3.0)
+    env.reset(seed=7)
+    state, generator = env.snapshot
+    stored = json.loads(json.dumps(generator))
+    following = [env.reset()[1]["randomisation"]["phantom_shift"] for _ in range(3)]
+    other = made(phantom_shift=3.0)
+    other.reset(seed=8)
+    other.reset()
+    for each in (env, other):
+        each.snapshot = (state, stored)
+        again = [each.reset()[1]["randomisation"]["phantom_shift"] for _ in range(3)]
+        np.testing.assert_array_equal(again, following)
 
 
 def test_the_same_seed_gives_the_same_trajectory_again():
@@ -350,5 +370,6 @@ def test_a_camera_of_another_distribution_moves_as_front_does() -> None:
             for key in ("pos", "quat", "fovy"):
                 ours, before = (getattr(each.model.camera(name), key) for each in (env, without))
                 np.testing.assert_array_equal(ours, before)
+        without.reset(seed=4)  # an env that was made before goes on without it
     finally:
         cameras.CAMERAS.unregister("side")

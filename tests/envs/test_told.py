@@ -25,8 +25,26 @@ def test_told_when_the_success_would_have_it_go_on_the_procedure_is_the_same() -
         _, _, terminated, _, info = env.step(action)
         np.testing.assert_array_equal(env.data.qpos, qpos)
         reached.append(info["progress"])
+        if len(reached) % 20 == 0:
+            measured = env.measure()
+            for key in ("is_success", "paper_success", "progress"):
+                assert measured[key] == info[key]
     assert terminated and info["is_success"] and info["paper_success"]
     assert sorted(set(reached)) == [0, 1, 2, 3, 4, 5] and reached == sorted(reached)
+
+
+def test_measuring_says_what_the_step_said() -> None:
+    played = expert_procedure(SEED)
+    env = envs.make(TaskConfig("suture"))
+    env.reset(seed=SEED)
+    for action in played.actions:
+        phase = env.phase
+        *_, info = env.step(action)
+        measured = env.measure()
+        if env.phase == phase:
+            for key in ("subtask_success", "is_success", "paper_success", "progress"):
+                assert measured[key] == info[key]
+    assert info["is_success"] and info["progress"] == 5
 
 
 def test_without_a_word_the_first_subtask_goes_on_for_ever() -> None:

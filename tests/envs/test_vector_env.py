@@ -161,6 +161,9 @@ def test_a_workers_error_and_its_death_are_told():
         vector.step(np.full((2, 7), np.nan, np.float32))
     with pytest.raises(InputError, match="closed"):
         vector.step(np.zeros((2, 7), np.float32))
+    vector = make_vec("place", "workers", randomisation={"light": 0.2})
+    with pytest.raises(InputError, match="Did you mean 'light'"):
+        vector.reset(options={"randomisation": {"lihgt": [0.1]}})
     vector = make_vec("place", "workers")
     os.kill(vector._workers[1].pid, signal.SIGKILL)
     vector._workers[1].join()

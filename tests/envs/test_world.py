@@ -367,6 +367,21 @@ def test_what_was_reported_may_be_given_again():
         np.testing.assert_array_equal(again["randomisation"][axis], numbers)
 
 
+def test_a_needle_that_is_given_is_the_one_that_is_drawn():
+    """Whether or not the env draws needles itself, and back to its own."""
+    shape = {"needle_arc": [math.pi / 3], "needle_size": [0.2], "needle_thickness": [0.3]}
+    env = envs.make(TaskConfig(randomisation=RandomisationConfig(light=0.1)))
+    size = (96, 96)
+    env.reset(seed=0)
+    own = env.image("front", size)
+    for given in (shape, {axis: [0.0] for axis in shape}):
+        env.reset(seed=0, options={"randomisation": given})
+        fresh = envs.make(TaskConfig(randomisation=RandomisationConfig(light=0.1)))
+        fresh.reset(seed=0, options={"randomisation": given})
+        np.testing.assert_array_equal(env.image("front", size), fresh.image("front", size))
+        assert np.array_equal(env.image("front", size), own) == (given is not shape)
+
+
 def test_the_limits_of_the_axes_are_those_of_the_world():
     for axis, value in dataclasses.asdict(WORLD).items():
         if axis in RANDOMISATION_LIMITS and axis in AXES and axis != "needle_size":

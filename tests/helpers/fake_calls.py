@@ -24,6 +24,10 @@ def crash(report):
     raise ZeroDivisionError("by hand")
 
 
+def read_nothing(report):
+    raise EOFError("No data left in file")
+
+
 def die(report):
     os.kill(os.getpid(), signal.SIGKILL)
 

@@ -30,12 +30,8 @@ class LiveViews:
         self.shown = shown
         self.orbit = Orbit()
         self._env = env
-        if (size, size) == env.view.image_size:
-            # Renderers of one size share GPU objects, and so the needle of an earlier episode.
-            size += 2
         self._size = (size, size)
         self._rig = Rig(env.simulation, env.calibration)
-        self._draws = env.simulation.draws
 
     def handle(self, command: Command) -> bool:
         """Follow a command; return False if it is not one of `VIEW_COMMANDS`."""
@@ -55,9 +51,6 @@ class LiveViews:
 
     def render(self) -> Images:
         """Return the present image of every view that is shown."""
-        if self._env.simulation.draws is not self._draws:  # the needle may have another shape now
-            self._rig.close()
-            self._draws = self._env.simulation.draws
         return {view: self._image(view) for view in self.shown}
 
     def close(self) -> None:

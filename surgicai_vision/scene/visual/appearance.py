@@ -282,12 +282,18 @@ def shown(model: mujoco.MjModel) -> NDArray[np.float64]:
 
 
 def paint(model: mujoco.MjModel, context: mujoco.MjrContext) -> None:
-    """Draw the textures of the model's appearance and upload them to an OpenGL context."""
+    """Draw the textures of the model's appearance and upload them to an OpenGL context.
+
+    The model keeps those of the plain look, with which a new context begins.
+    """
     for name, image in draw_textures(Appearance.of_numbers(*shown(model))).items():
         texture = model.texture(name)
         start = int(model.tex_adr[texture.id])
-        model.tex_data[start : start + image.size] = image.ravel()
+        place = model.tex_data[start : start + image.size]
+        plain = place.copy()
+        place[:] = image.ravel()
         mujoco.mjr_uploadTexture(model, context, texture.id)
+        place[:] = plain
     context.mat_texid[: model.mat_texid.size] = model.mat_texid.ravel()
 
 
