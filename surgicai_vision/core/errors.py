@@ -27,7 +27,7 @@ class SurgicaiError(Exception):
 
 
 def _with_message(kind: type[SurgicaiError], arguments: tuple[object, ...]) -> SurgicaiError:
-    """Return an error as it was pickled; `__new__` keeps the arguments, `__init__` is not called."""
+    """Return an error as it was pickled: with its arguments, and without a call of `__init__`."""
     return kind.__new__(kind, *arguments)
 
 
