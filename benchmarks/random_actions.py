@@ -28,6 +28,7 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import SceneConfig, TaskConfig, to_mapping
 from surgicai_vision.core.errors import SurgicaiError
+from surgicai_vision.core.files import code_version
 from surgicai_vision.demos.expert import Expert
 
 STEPS = 200
@@ -59,12 +60,13 @@ KEYS = (
 
 
 class Job(NamedTuple):
-    """Some episodes of one task, from its starts or from within the tissue."""
+    """Some episodes of one task, from its starts or from within the tissue, under one code."""
 
     config: TaskConfig
     seeds: range
     hold: int
     inside: bool
+    code: str
 
 
 def play(job: Job) -> dict[str, Any]:
@@ -136,7 +138,7 @@ def jobs_of(chosen: argparse.Namespace) -> list[Job]:
         for task in tasks if episodes else ():
             config = TaskConfig(task, scene, max_steps=STEPS)
             jobs += [
-                Job(config, seeds, chosen.hold, half_way)
+                Job(config, seeds, chosen.hold, half_way, code_version())
                 for seeds in chunks(chosen.seed, -(-episodes // len(tasks)))
             ]
     return jobs

@@ -34,9 +34,9 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 from common import emit, spread_resumable
 
 from surgicai_vision.core import names
-from surgicai_vision.core.files import code_version
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
+from surgicai_vision.evaluation.provenance import episode_code
 from surgicai_vision.evaluation.rollout import evaluate
 
 PROCEDURE = "released:suture"
@@ -206,7 +206,7 @@ def main() -> None:
     # A shell's background jobs ignore Ctrl-C; `robot serve` would inherit this, but ends by Ctrl-C.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     clocks = CLOCKS if chosen.clock == "both" else (chosen.clock,)
-    code = code_version()
+    code = episode_code()
     jobs = [
         Job(way, chosen.policy, chosen.transport, code, first, min(CHUNK, end - first))
         for end in (chosen.seed + chosen.episodes,)

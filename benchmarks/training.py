@@ -43,6 +43,7 @@ class Noise:
         self.policy_views = self.views
         self.config = TaskConfig("grasp")
         self.episode_index = np.arange(length) // EPISODE
+        self.demonstration_index = self.episode_index
 
     def frames(self, view: str, start: int, stop: int) -> np.ndarray:
         """Return frames start..stop."""

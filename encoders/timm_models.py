@@ -127,12 +127,16 @@ def plugin_for(name: str) -> Plugin:
 
 
 def _dim(name: str) -> int:
-    """Length of a timm network's pooled feature, from its structure alone."""
+    """Length of a timm network's pooled feature, from its structure alone.
+
+    A head with a hidden layer keeps it without its classifier.
+    """
     import timm
     import torch
 
     with torch.device("meta"):
-        return int(timm.create_model(name, num_classes=0).num_features)
+        network = timm.create_model(name, num_classes=0)
+    return int(getattr(network, "head_hidden_size", network.num_features))
 
 
 DINOV2 = Plugin(DINOV2_CARD, build)

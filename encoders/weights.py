@@ -8,8 +8,9 @@ Interface:
   ("unpinned"), the hash reported by the hub is used. Without a network it raises `MissingWeights`
   within seconds.
 
-In the folder of `SURGICAI_VISION_WEIGHTS` a file is looked for as `<encoder>/<filename>`,
-`<encoder>.<suffix>` and `<filename>`.
+In the folder of `SURGICAI_VISION_WEIGHTS` a file is looked for as `<encoder>/<filename>` and
+`<encoder>.<suffix>`, and, if its hash is known beforehand, as `<filename>`: many networks publish
+their weights under the same name.
 """
 
 import functools
@@ -75,7 +76,8 @@ def missing_line(card: EncoderCard, offline_encoders: tuple[str, ...], problem: 
         f"Encoder '{card.name}' needs {card.filename} of the hub repository {card.source} "
         f"(revision {card.revision}, sha256 {card.sha256 or 'unpinned'}), which is neither on "
         f"this machine nor downloadable{reason}; pass it with --weights FILE or put it in the "
-        f"folder ${FOLDER_VARIABLE}. Encoders that work offline: {', '.join(offline_encoders)}."
+        f"folder ${FOLDER_VARIABLE} as {card.name}{Path(str(card.filename)).suffix}. "
+        f"Encoders that work offline: {', '.join(offline_encoders)}."
     )
 
 
@@ -101,15 +103,13 @@ def _in_folder(card: EncoderCard, wanted: Mapping[str, str | None]) -> Path | No
     if not folder:
         return None
     for filename, sha256 in wanted.items():
-        places = (
-            Path(card.name) / filename,
-            Path(card.name + Path(filename).suffix),
-            Path(filename),
-        )
-        for place in places:
+        for place in (Path(card.name) / filename, Path(card.name + Path(filename).suffix)):
             path = Path(folder) / place
             if path.is_file():
                 return check_hash(path, sha256)
+        path = Path(folder) / filename
+        if sha256 and path.is_file() and sha256_file(path).startswith(sha256):
+            return path
     return None
 
 

@@ -131,11 +131,12 @@ def _head(shape: tuple[int, ...], map_head: str) -> Head:
     return heads[len(shape)](*shape)
 
 
-@final
-class FeatureHeads(nn.Module):
-    """Only the head of each feature, for policies that add their own network.
+class _Heads(nn.Module):
+    """The head of each feature.
 
     Attributes:
+        inputs: the layout of the inputs.
+        shapes: shape of each feature that has its own head.
         dim: length of the heads' output, 0 without images.
     """
 
@@ -147,20 +148,33 @@ class FeatureHeads(nn.Module):
         self.heads = nn.ModuleList(heads)
         self.dim = sum(head.dim for head in heads)
 
+    def outputs(self, observed: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
+        """Return each head's output, (B, head.dim), and the vector fed with the features, (B, n).
+
+        Args:
+            observed: normalised inputs (B, inputs.dim).
+        """
+        sizes = [math.prod(shape) for shape in self.shapes]
+        *rows, vector = observed.split([*sizes, self.inputs.width], dim=1)
+        return [head(row) for head, row in zip(self.heads, rows, strict=True)], vector
+
+
+@final
+class FeatureHeads(_Heads):
+    """Only the head of each feature, for policies that add their own network."""
+
     def forward(self, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the heads' output, (B, dim), and the vector fed with the features, (B, n).
 
         Args:
             observed: normalised inputs (B, inputs.dim).
         """
-        sizes = [math.prod(shape) for shape in self.shapes]
-        *rows, vector = observed.split([*sizes, self.inputs.dim - self.inputs.features], dim=1)
-        seen = [head(row) for head, row in zip(self.heads, rows, strict=True)]
+        seen, vector = self.outputs(observed)
         return torch.cat(seen, dim=1) if seen else vector[:, :0], vector
 
 
 @final
-class FeatureMLP(nn.Module):
+class FeatureMLP(_Heads):
     """The paper's network on features and a vector: layers, each preceded by BatchNorm.
 
     Attributes:
@@ -168,13 +182,9 @@ class FeatureMLP(nn.Module):
     """
 
     def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
-        super().__init__()
-        self.inputs = inputs
-        self.shapes = visual_shapes(recipe, inputs.visual)
-        heads = [_head(shape, recipe.map_head) for shape in self.shapes]
-        self.heads = nn.ModuleList(heads)
+        super().__init__(recipe, inputs)
         layers: list[nn.Module] = []
-        self.width = width = sum(head.dim for head in heads) + inputs.dim - inputs.features
+        self.width = width = self.dim + inputs.width
         for hidden in recipe.hidden:
             layers += [nn.BatchNorm1d(width)] if recipe.batch_norm else []
             layers += [nn.Linear(width, hidden), nn.ReLU()]
@@ -188,7 +198,5 @@ class FeatureMLP(nn.Module):
 
     def seen(self, observed: torch.Tensor) -> torch.Tensor:
         """Return the heads' output concatenated with the vector, (B, width)."""
-        sizes = [math.prod(shape) for shape in self.shapes]
-        *rows, vector = observed.split([*sizes, self.inputs.dim - self.inputs.features], dim=1)
-        seen = [head(row) for head, row in zip(self.heads, rows, strict=True)]
+        seen, vector = self.outputs(observed)
         return torch.cat([*seen, vector], dim=1)

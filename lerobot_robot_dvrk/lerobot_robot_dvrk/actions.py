@@ -85,6 +85,9 @@ class Reader(Protocol):
     def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
         """Return arm → its set point; empty if the action gives `moves`."""
 
+    def forget(self) -> None:
+        """Forget earlier actions: they were not sent, or an episode begins."""
+
 
 @final
 class Increments:
@@ -103,6 +106,9 @@ class Increments:
     def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
         """Return nothing."""
         return {}
+
+    def forget(self) -> None:
+        """Do nothing: every action stands for itself."""
 
 
 @final
@@ -125,6 +131,9 @@ class Delta:
     def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
         """Return nothing."""
         return {}
+
+    def forget(self) -> None:
+        """Do nothing: every action stands for itself."""
 
 
 @final
@@ -181,6 +190,11 @@ class Leader:
         """Return nothing."""
         return {}
 
+    def forget(self) -> None:
+        """Forget where the joints were, and motion that has not been sent."""
+        self._last.clear()
+        self._waiting.clear()
+
 
 @final
 class Absolute:
@@ -218,6 +232,9 @@ class Absolute:
             pose = poses.compose(poses.invert(base), (x, y, z, *turn))
             found[arm] = Command(pose, jaw * robot.jaw_scale)
         return found
+
+    def forget(self) -> None:
+        """Do nothing: every action stands for itself."""
 
 
 ACTIONS: Mapping[str, Callable[[StepSize, Mapping[str, str]], Reader]] = MappingProxyType(

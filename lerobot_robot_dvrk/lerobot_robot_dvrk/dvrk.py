@@ -4,8 +4,9 @@
         --teleop.type=surgicai_page --fps=50
 
 Every command passes the guards of `robot drive` (`robot.guards`). If they find a problem, or an arm
-is paused or stopped, nothing is sent, the log says why, and the arm stays at its set point. An
-action is meant for one control step of 20 ms: run LeRobot's loops at 50 frames per second.
+is paused or stopped, nothing is sent, the log says why, and the arm stays at its set point. What a
+leader arm does meanwhile is not made up for. An action is meant for one control step of 20 ms: run
+LeRobot's loops at 50 frames per second.
 
 A served simulation begins its next start some time after a success, when an action requests it
 (`surgicai_page`), and when only observations are read, as `lerobot-rollout` does between episodes.
@@ -138,6 +139,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
             )
             self._client.connect()
             self._stack = stack.pop_all()
+        self._reader.forget()
         if config.simulated:
             self._begin(config.seed)
         elif not drive.sends:
@@ -195,8 +197,10 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
                 commands, problem = self._planned(action, now)
             except InputError as error:
                 problem = str(error)
+        if problem:
+            self._reader.forget()
         self._tell(problem)
-        self._setpoints.send({} if problem else commands)
+        self._setpoints.send({} if problem else commands, now)
         self._steps += 1
         return action
 
@@ -246,6 +250,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         self._client.reset(seed)
         self._robot.begin()
         self._setpoints.forget()
+        self._reader.forget()
         self._steps = 0
         self._observations = 0
         self._solved = None

@@ -11,7 +11,7 @@ surgicai-vision gets that package's own check.
 import tempfile
 from pathlib import Path
 
-from lerobot_salvage.verify import Verifier
+from lerobot_salvage.verify import Verifier, claimed_episodes
 from surgicai_vision.core import names
 from surgicai_vision.core.config import digest
 from surgicai_vision.core.files import sha256_file
@@ -35,7 +35,7 @@ def check_dataset(path: Path, progress: Progress = silent) -> CheckReport:
         return check.check_dataset(path, progress)
     files = LeRobotFiles(path)
     info = files.info
-    claimed = int(info.get("total_episodes") or 0)
+    claimed = claimed_episodes(files)
     rows: list[tuple[int, int, int]] = []
     start = 0
     with tempfile.TemporaryDirectory(prefix="lerobot-salvage-") as scratch:

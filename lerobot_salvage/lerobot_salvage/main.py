@@ -15,7 +15,8 @@ from cyclopts import App, CycloptsError, Parameter
 from lerobot_salvage.check import check_dataset
 from lerobot_salvage.repair import repair_dataset
 from surgicai_vision.commands.console import Console
-from surgicai_vision.core.errors import SurgicaiError
+from surgicai_vision.commands.os_errors import drop_output, of_os_error
+from surgicai_vision.core.errors import InputError, SurgicaiError
 
 PROGRAM = "lerobot-salvage"
 Dataset = Annotated[Path, Parameter(metavar="DIR")]
@@ -37,16 +38,22 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return app(sys.argv[1:] if arguments is None else arguments) or 0
     except CycloptsError as error:
-        return _fail(f"{error} See `{PROGRAM} --help`.", 2)
+        return _fail(InputError(f"{error} See `{PROGRAM} --help`."))
     except SurgicaiError as error:
-        return _fail(str(error), error.exit_code)
+        return _fail(error)
     except KeyboardInterrupt:
-        return _fail("interrupted; the dataset is unchanged.", 1)
+        return _fail(SurgicaiError("interrupted; the dataset is unchanged."))
+    except BrokenPipeError:
+        drop_output()
+        return 1
+    except OSError as error:
+        return _fail(of_os_error(error))
 
 
-def _fail(text: str, exit_code: int) -> int:
-    print(f"{PROGRAM}: error: {' '.join(text.split())}", file=sys.stderr)
-    return exit_code
+def _fail(error: SurgicaiError) -> int:
+    """Print an error in one line and return its exit code."""
+    print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return error.exit_code
 
 
 @app.command

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_salvage.check import check_dataset
-from lerobot_salvage.verify import Verified, Verifier
+from lerobot_salvage.verify import Verified, Verifier, claimed_episodes
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, SurgicaiError
 from surgicai_vision.core.executor import claim, work_folder
@@ -80,7 +80,7 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress = sil
     """
     before = _checked(path)
     files = LeRobotFiles(path)
-    claimed = int(files.info.get("total_episodes") or 0)
+    claimed = claimed_episodes(files)
     if before is not None and before.ok:
         return Repair(path, before.episodes, before.frames, claimed, None, ())
     if out is not None:
@@ -88,8 +88,8 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress = sil
     elif _free(path, "broken") is None:
         raise BadFile(f"100 broken datasets already exist next to {path}; give --out DIR.")
     work = work_folder(out or path)
-    try:
-        with claim(work):
+    with claim(work):
+        try:
             made = work / "result"
             shutil.rmtree(made, ignore_errors=True)
             rows = _write(files, made, work, claimed, progress)
@@ -100,8 +100,8 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress = sil
                 )
             problems = tuple(files.problems) or (before.problems if before else ())
             original = _commit(made, path, out)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
     return Repair(out or path, len(rows), rows[-1].stop, claimed, original, problems)
 
 

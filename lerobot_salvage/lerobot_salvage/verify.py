@@ -268,6 +268,12 @@ class Verifier:
         return self._lengths[path]
 
 
+def claimed_episodes(files: LeRobotFiles) -> int:
+    """Return the number of episodes according to `info.json`, 0 if it does not say a number."""
+    claimed = files.info.get("total_episodes")
+    return claimed if isinstance(claimed, int) else 0
+
+
 def _ours(path: Path) -> Table:
     """Return the content of `meta/surgicai.json`; empty if it cannot be read."""
     try:

@@ -28,7 +28,7 @@ class Options:
     """Options of `export-demos`.
 
     Attributes:
-        task: The demonstrations' task.
+        task: The task, which must be that of given demonstrations.
         demos: Folder of demonstrations.
         obs_type: What the transitions observe; goal allows hindsight relabelling.
         format: File format: npz, or that of Stable-Baselines3, d3rlpy, Minari or robomimic.
@@ -37,7 +37,7 @@ class Options:
         out: Folder to create.
     """
 
-    task: Annotated[str, TASK] = "grasp"
+    task: Annotated[str | None, TASK, default_text("the demonstrations', else grasp")] = None
     demos: Annotated[Path | None, DIRECTORY, default_text("outputs/demos/<task>")] = None
     obs_type: Annotated[str, Parameter(choices=OBS_TYPES)] = "relative"
     format: Annotated[str, Parameter(choices=FORMATS)] = "npz"
@@ -61,12 +61,14 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     check_extra(f"--format {options.format}", *export.PACKAGES[options.format])
     if options.format == "d3rlpy" and options.obs_type == "goal":
         raise InputError("d3rlpy takes no goal dicts; give --obs-type relative or state.")
-    name = f"{options.task}-{options.obs_type}-{options.format}"
+    demos = options.demos or folders.demos_folder(options.task or "grasp")
+    paths = list_demos(demos)[: options.episodes]
+    recorded = read_demo(paths[0]).config
+    folders.check_task(options.task, recorded.task, demos)
+    name = f"{recorded.task}-{options.obs_type}-{options.format}"
     out = options.out or folders.OUTPUTS / "transitions" / name
-    folders.check_folder(out, export.CARD)
-    paths = list_demos(options.demos or folders.demos_folder(options.task))[: options.episodes]
-    recorded = to_mapping(read_demo(paths[0]).config)
-    config = from_mapping(TaskConfig, {**recorded, **(options.env or {})}, "env")
+    folders.check_folder(out, export.CARD, ours=export.FILES.values())
+    config = from_mapping(TaskConfig, {**to_mapping(recorded), **(options.env or {})}, "env")
     with console.stage("transitions", "demonstrations") as progress:
         transitions = of_demos(paths, config, options.obs_type, progress)
     written = export.write(transitions, options.format, out)

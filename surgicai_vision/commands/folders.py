@@ -69,6 +69,21 @@ def demos_task(folder: Path) -> str:
     return str(read_marker(folder)["task"])
 
 
+def check_task(given: str | None, recorded: str, folder: Path) -> None:
+    """Refuse a task that is not the one that the data of a folder show.
+
+    Args:
+        given: the option --task; None goes with any data.
+        recorded: the data's task.
+        folder: where they are, for the message.
+
+    Raises:
+        InputError: another task is given.
+    """
+    if given not in (None, recorded):
+        raise InputError(f"--task {given}: {folder} shows {recorded}; leave --task out.")
+
+
 def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> "RenderedDataset":
     """Open a dataset, by default the task's.
 

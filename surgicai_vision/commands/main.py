@@ -5,7 +5,6 @@ Deliberate errors (`SurgicaiError`) and wrong input print one line without a tra
 module, and what it needs, is imported only when that command runs, so `--help` is instant.
 """
 
-import errno
 import io
 import json
 import os
@@ -30,6 +29,7 @@ from rich.text import Text
 
 from surgicai_vision.commands import COMMANDS, PROGRAM, register
 from surgicai_vision.commands.options import from_file, split_comma_lists
+from surgicai_vision.commands.os_errors import drop_output, of_os_error
 from surgicai_vision.core.errors import INTERRUPTED, InputError, SurgicaiError, UnknownName
 from surgicai_vision.core.processes import Terminated, raise_on_terminate
 
@@ -37,8 +37,6 @@ TITLE = (
     "Image-based imitation learning for robotic suturing: "
     "scene → env → demos → dataset → features → policy → evaluation → report"
 )
-FULL = (errno.ENOSPC, errno.EDQUOT)
-NO_ROOM = "The disk is full; make room, and run the same command again to continue."
 TERMINATED = 128 + signal.SIGTERM
 """Exit code after SIGTERM, as a shell reports it."""
 EVERYWHERE = Group("Options of every command", sort_key=1)
@@ -94,16 +92,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{PROGRAM}: {INTERRUPTED}", file=sys.stderr)
         return TERMINATED if isinstance(interrupt, Terminated) else 1
     except BrokenPipeError:
-        # Standard output is closed; Python would complain when flushing it at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        drop_output()
         return 1
     except OSError as error:
-        if error.errno in FULL:
-            return _fail(SurgicaiError(NO_ROOM))
-        if error.filename is None:
-            raise
-        kind = InputError if error.errno == errno.ENAMETOOLONG else SurgicaiError
-        return _fail(kind(f"{error.filename}: {error.strerror}."))
+        return _fail(of_os_error(error))
 
 
 def _show_what_can_be_shown() -> None:

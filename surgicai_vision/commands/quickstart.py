@@ -14,6 +14,7 @@ from surgicai_vision.commands.options import (
     DIRECTORY,
     FILE_ONLY,
     FRACTION,
+    IMAGE_SIZE,
     SEED,
     TASK,
     VIEWS,
@@ -49,7 +50,7 @@ class Options:
     demonstrations: Annotated[int, COUNT] = Quickstart.demonstrations
     noise: Annotated[float, FRACTION] = Quickstart.noise
     view: Annotated[tuple[str, ...], VIEWS] = Quickstart.view
-    size: Annotated[int, COUNT, Parameter(metavar="PX")] = Quickstart.size
+    size: Annotated[int, IMAGE_SIZE] = Quickstart.size
     frame_stride: Annotated[int, COUNT] = Quickstart.frame_stride
     episodes: Annotated[int, COUNT] = Quickstart.episodes
     seed: Annotated[int, SEED] = Quickstart.seed

@@ -69,7 +69,7 @@ class Options:
     ] = ()
     task: Annotated[str | None, TASK, default_text("grasp")] = None
     episodes: Annotated[int | None, COUNT, default_text("50")] = None
-    seed: Annotated[int, SEED] = names.TRAIN_SEED
+    seed: Annotated[int | None, SEED, default_text(str(names.TRAIN_SEED))] = None
     view: Annotated[
         tuple[str, ...], VIEWS, default_text("front,back; for open-h its endoscope and wrist views")
     ] = ()
@@ -83,7 +83,7 @@ class Options:
         Parameter(choices=RANDOMISATION_CHOICES["appearance"][1:]),
         default_text("as recorded"),
     ] = None
-    distractors: Annotated[int | None, within(0, 5), default_text("as recorded")] = None
+    distractors: Annotated[int | None, within(1, 5), default_text("as recorded")] = None
     variants: Annotated[int, COUNT] = 1
     corruption: Annotated[float, FRACTION] = 0.0
     video: Annotated[str | None, VIDEO, default_text("lossless images")] = None
@@ -106,9 +106,11 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 
     # Wrong input is found before any work.
     context = RunContext(options.workers, open_engine(options.executor), console.stage)
-    if options.demos and (options.task or options.episodes or options.env):
+    recorded = (options.task, options.episodes, options.seed, options.env)
+    if options.demos and any(value is not None for value in recorded):
         raise InputError(
-            "--task, --episodes and env say what to record; with --demos DIR nothing is recorded."
+            "--task, --episodes, --seed and env say what to record; with --demos DIR nothing is "
+            "recorded."
         )
     variants = None
     if options.appearance or options.distractors or options.corruption or options.variants > 1:
@@ -166,7 +168,7 @@ def _record(options: Options, task: str, console: Console) -> Path:
     asked = record_demos.Options(
         task=task,
         episodes=options.episodes or 50,
-        seed=options.seed,
+        seed=names.TRAIN_SEED if options.seed is None else options.seed,
         workers=options.workers,
         executor=options.executor,
         env=options.env,

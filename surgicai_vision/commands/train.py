@@ -1,8 +1,9 @@
 """`train`: train a policy on a dataset's features, or with `--algo` by reinforcement learning."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter, validators
@@ -76,7 +77,7 @@ class Options:
     """Options of `train`.
 
     Attributes:
-        task: The dataset's task.
+        task: The task, which must be that of a given dataset or of given demonstrations.
         dataset: Folder of the dataset.
         subtask: Train on one subtask's frames of whole procedures, for a hierarchical policy.
         view: Views that the policy sees.
@@ -118,7 +119,7 @@ class Options:
         env: Fields of the env, such as hold_jaw.
     """
 
-    task: Annotated[str, TASK] = "grasp"
+    task: Annotated[str | None, TASK, default_text("the data's, else grasp")] = None
     dataset: DatasetFolder = None
     subtask: Annotated[str | None, SUBTASK, Parameter(metavar="SUBTASK")] = None
     encoder: Annotated[
@@ -180,6 +181,7 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode what is not in the cache, train and print where the checkpoint is."""
+    _refuse_unread(options)
     if options.low:
         return _high_level(options, options.low, console)
     if options.residual_on:
@@ -188,7 +190,6 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         return _reinforce(options, options.algo, console)
     if options.device is not None:
         find_device(options.device)
-    _refuse_reinforcement(options)
     weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
@@ -200,9 +201,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             f"Policy '{options.policy}' learns from whole procedures; leave --subtask "
             f"{options.subtask} out."
         )
-    task = names.SUTURE if options.subtask else options.task
     run = RunConfig(
-        TaskConfig(task),
+        TaskConfig(names.SUTURE if options.subtask else options.task or "grasp"),
         encoder,
         _views(options, encoder),
         policy=options.policy,
@@ -214,10 +214,12 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     )
     # Refuses a recipe that does not exist before any work.
     policies.check_progress_from(policies.recipe_of(run), options.progress_from)
+    rendered = folders.open_dataset(options.dataset, run.task, run.views)
+    task = rendered.config.task
+    folders.check_task(options.task, task, rendered.path)
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = options.out or folders.train_folder(label, run.name, run.seed)
     folders.check_folder(out, REQUEST)
-    rendered = folders.open_dataset(options.dataset, task, run.views)
     is_high_level = policies.policy_plugin(run.policy).target == names.STAGE
     if rendered.late and not is_high_level:
         console.note(
@@ -279,29 +281,63 @@ def _views(options: Options, encoder: str | None) -> tuple[str, ...]:
     return ("front", "back") if options.view is None else options.view
 
 
-IMITATION = ("dataset", "subtask", "view", "start", "epochs", "minutes", "device")
-"""Options that only imitation from a dataset reads."""
 LARGEST_REINFORCED_SEED = 2**32 - 1
 """Largest seed of Stable-Baselines3 and d3rlpy, as of NumPy's legacy generator."""
-REINFORCEMENT = ("observation", "env_steps", "updates", "validation", "seeds", "decisions", "bound")
-"""Options that imitation does not read, like `env`; `workers` changes no result."""
+IMITATION = "imitation from a dataset"
+ONLINE = "an online --algo"
+OFFLINE = "an offline --algo"
+LOW = "--low"
+RESIDUAL = "--residual-on"
+_EVERY = ("algo", "save_every", "seed", "out")
+_VALIDATED = (*_EVERY, "validation", "seeds")
+_ACTOR = (
+    *(*_VALIDATED, "task", "change", "log", "demos", "demonstrations"),
+    *("observation", "workers", "env"),
+)
+READ: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        IMITATION: (
+            *(*_EVERY, "task", "dataset", "subtask", "demos", "demonstrations"),
+            *("encoder", "view", "weights", "accept_licence", "pool"),
+            *("policy", "recipe", "change", "epochs", "minutes", "start", "progress_from"),
+            *("device", "log"),
+        ),
+        ONLINE: (*_ACTOR, "env_steps"),
+        OFFLINE: (*_ACTOR, "updates"),
+        LOW: (*_VALIDATED, "task", "low", "decisions", "weights", "accept_licence"),
+        RESIDUAL: (
+            *(*_VALIDATED, "residual_on", "bound", "change", "env_steps"),
+            *("weights", "accept_licence"),
+        ),
+    }
+)
+"""Way of training → the options that it reads."""
 
 
-def _refuse_reinforcement(options: Options) -> None:
-    """Refuse options that imitation would ignore, if they differ from their defaults."""
-    if options.env:
-        raise InputError(
-            "env is for --algo: imitation takes the env of its dataset; leave it out, or record "
-            "and render demonstrations in it."
-        )
-    defaults = {field.name: field.default for field in fields(Options)}
-    for name in REINFORCEMENT:
-        if getattr(options, name) != defaults[name]:
-            option = name.replace("_", "-")
-            raise InputError(
-                f"--{option} is for --algo, and imitation from a dataset does not read it; leave "
-                "it out" + (", and run once for each --seed." if name == "seeds" else ".")
-            )
+def _way(options: Options) -> str:
+    """Return the way of training, a key of `READ`, that the options choose."""
+    if options.low:
+        return LOW
+    if options.residual_on:
+        return RESIDUAL
+    if options.algo:
+        return ONLINE if ALGORITHMS[options.algo].is_online else OFFLINE
+    return IMITATION
+
+
+def _refuse_unread(options: Options) -> None:
+    """Refuse options that this way of training does not read, if they differ from their defaults.
+
+    Raises:
+        InputError: there is one; the message says which ways of training read it.
+    """
+    way = _way(options)
+    for field in fields(Options):
+        if field.name in READ[way] or getattr(options, field.name) == field.default:
+            continue
+        option = "env" if field.name == "env" else f"--{field.name.replace('_', '-')}"
+        readers = ", ".join(other for other, read in READ.items() if field.name in read)
+        raise InputError(f"{option} is not read by {way}, only by {readers}: leave it out.")
 
 
 def _reinforce(options: Options, algo: str, console: Console) -> dict[str, object]:
@@ -312,17 +348,19 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
 
     algorithm = ALGORITHMS[algo]
     check_extra(f"--algo {algo}", "stable_baselines3", "sb3_contrib", algorithm.library)
-    for name in IMITATION:
-        if getattr(options, name) is not None:
-            raise InputError(f"--{name} is for imitation from a dataset; leave it or --algo out.")
-    config = task_config(options.task, options.env)
+    if options.log == "wandb":
+        raise InputError("--log wandb is for imitation; --algo logs to tensorboard or none.")
     settings = settings_of(algo, read_changes(options.change))
+    task = options.task or "grasp"
     demos: list[Path] = []
     if algorithm.needs_demos:
-        demos = list_demos(options.demos or folders.demos_folder(options.task))
-        demos = demos[: options.demonstrations]
+        folder = options.demos or folders.demos_folder(task)
+        demos = list_demos(folder)[: options.demonstrations]
+        task = folders.demos_task(folder)
+        folders.check_task(options.task, task, folder)
     elif options.demos or options.demonstrations:
         raise InputError(f"--algo {algo} does not learn from demonstrations; leave --demos out.")
+    config = task_config(task, options.env)
     requests = [
         Request(
             algo=algo,
@@ -384,11 +422,6 @@ def _high_level(options: Options, low: Path, console: Console) -> dict[str, obje
             f"--low goes with --task {names.SUTURE} --algo ppo; got --task {options.task} --algo "
             f"{options.algo}."
         )
-    for name in (*IMITATION, "demos", "demonstrations"):
-        if getattr(options, name) is not None:
-            raise InputError(f"--{name} does not go with --low; leave it out.")
-    if options.change or options.env:
-        raise InputError("--change and env do not go with --low; leave them out.")
     if options.out and options.seeds > 1:
         raise InputError("--out names one folder; leave it out where --seeds trains several.")
     check_extra("--low", "stable_baselines3")
@@ -405,11 +438,12 @@ def _high_level(options: Options, low: Path, console: Console) -> dict[str, obje
     ]
     from surgicai_vision.rl.high_level import run_of, train_high_level
 
+    weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     runs = [run_of(request, TaskConfig(names.SUTURE)) for request in requests]
     outs = _checked_folders(options, runs)
     for request, run, out in zip(requests, runs, outs, strict=True):
         with console.stage(f"high-level policy: {run.name}", "decisions") as progress:
-            train_high_level(request, out, progress=progress)
+            train_high_level(request, out, weights=weights, progress=progress)
         console.say(f"checkpoint: {out}")
     console.say(f"next: set hlp: {outs[0]} in {low}, then surgicai-vision evaluate {low}")
     return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}
@@ -421,9 +455,6 @@ def _residual(options: Options, base: Path, console: Console) -> dict[str, objec
 
     if options.algo != ALGO:
         raise InputError(f"--residual-on goes with --algo {ALGO}; got --algo {options.algo}.")
-    for name in (*IMITATION, "demos", "demonstrations", "env"):
-        if getattr(options, name) is not None:
-            raise InputError(f"--{name} does not go with --residual-on; leave it out.")
     if options.out and options.seeds > 1:
         raise InputError("--out names one folder; leave it out where --seeds trains several.")
     check_extra("--residual-on", "stable_baselines3")
@@ -442,12 +473,13 @@ def _residual(options: Options, base: Path, console: Console) -> dict[str, objec
     ]
     from surgicai_vision.rl.residual import base_of, run_of, train_residual
 
-    corrected = base_of(requests[0]).run
+    weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
+    corrected = base_of(requests[0], weights).run
     runs = [run_of(request, corrected) for request in requests]
     outs = _checked_folders(options, runs)
     for request, run, out in zip(requests, runs, outs, strict=True):
         with console.stage(f"policy: {run.name}", "control steps") as progress:
-            train_residual(request, out, progress=progress)
+            train_residual(request, out, weights=weights, progress=progress)
         console.say(f"checkpoint: {out}")
     console.say(f"next: surgicai-vision evaluate {outs[0]}")
     return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}

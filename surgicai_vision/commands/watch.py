@@ -47,7 +47,7 @@ class Options:
     Attributes:
         task: The task.
         seed: Seed of the first start; each episode takes the next.
-        episodes: End after this many episodes.
+        episodes: Stop when this many episodes have ended.
         go_on: Begin the next start automatically.
         paused: Wait at the first start.
         window: Use MuJoCo's own viewer instead of the page; needs a display.

@@ -11,3 +11,12 @@ def runs_of(values: NDArray[np.generic]) -> list[tuple[int, int]]:
     count = len(values)
     edges = np.flatnonzero(values[1:] != values[:-1]) + 1
     return list(itertools.pairwise([0, *edges.tolist(), count])) if count else []
+
+
+def first_of_group(values: NDArray[np.generic]) -> NDArray[np.int64]:
+    """Return the index of the first element equal to each element of `values`, (N,) int64.
+
+    Args:
+        values: (N,), ascending, such as the episode of every frame.
+    """
+    return np.searchsorted(values, values)

@@ -66,7 +66,11 @@ class Layout(Protocol):
         """
 
     def task_config(self, config: TaskConfig, frame_stride: int) -> TaskConfig:
-        """Return the config of the env in which a policy's actions mean what the dataset's do."""
+        """Return the config of the env in which a policy's actions mean what the dataset's do.
+
+        Raises:
+            InputError: a frame stride that the layout does not support with this config.
+        """
 
 
 class SurgicaiLayout:
@@ -107,7 +111,12 @@ class SurgicaiLayout:
         return {names.ACTION: demo.action[::frame_stride], **schema.labels(demo, frame_stride)}
 
     def task_config(self, config: TaskConfig, frame_stride: int) -> TaskConfig:
-        """Return the config unchanged: whatever the stride, an action is that of one step."""
+        """Return the config unchanged: whatever the stride, an action is that of one step.
+
+        Raises:
+            InputError: the frames' spacing does not divide a second.
+        """
+        schema.check_spacing(frame_stride, config.action_repeat)
         return config
 
 

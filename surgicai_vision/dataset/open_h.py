@@ -28,7 +28,8 @@ do not mark them as observations, so no policy receives them. The original's tex
 fails on a text ("too many dimensions 'str'").
 
 An action is the commanded pose of the arms when the next frame is taken. With a frame stride, it is
-therefore held for that many control steps; `task_config` sets `action_repeat` accordingly.
+therefore held for that many control steps; `task_config` sets `action_repeat` accordingly. It is
+what was executed, so demonstrations with other labels (noise, upsets, a learner) are refused.
 """
 
 import dataclasses
@@ -149,7 +150,11 @@ class OpenHLayout:
         }
 
     def task_config(self, config: TaskConfig, frame_stride: int) -> TaskConfig:
-        """Return the config in which an action is held until the next frame."""
+        """Return the config in which an action is held until the next frame.
+
+        Raises:
+            InputError: it would be held for too long, or for a time that does not divide a second.
+        """
         held = config.action_repeat * frame_stride
         if held > ACTION_REPEAT_LIMIT:
             raise InputError(
@@ -158,6 +163,7 @@ class OpenHLayout:
                 f"most {ACTION_REPEAT_LIMIT}. Give a smaller frame_stride, or use "
                 "surgicai-vision's own layout."
             )
+        schema.check_spacing(frame_stride, config.action_repeat)
         return dataclasses.replace(config, action_repeat=held)
 
 

@@ -74,7 +74,8 @@ class RenderedDataset:
         views: cameras, in order.
         image_size: side of the images [px].
         length: number of frames N.
-        fps: frames per second of simulated time; `names.FPS` divided by the frame stride.
+        fps: frames per second of simulated time; `names.FPS` divided by the control
+            steps from frame to frame.
         variants: number of consecutive episodes that show one demonstration in different looks.
         video: codec of the RGB views, None if they are lossless images.
         late: the most control steps by which its demonstrators noticed a loss late

@@ -68,10 +68,11 @@ def render_demos(
         size: side of the square images [px].
         depth: also render depth, float32 [m].
         segmentation: also render part indices (`names.PARTS`).
-        frame_stride: render only every n-th frame of each episode, from its first; a divisor of
-            `names.FPS`, so that the dataset has `names.FPS / frame_stride` frames per second of
-            simulated time. Increments remain those of one step; set-points of layout "open-h" are
-            held until the next frame.
+        frame_stride: render only every n-th frame of each episode, from its first. Recorded frames
+            are `action_repeat` control steps apart, so that the dataset has `names.FPS /
+            (frame_stride * action_repeat)` frames per second of simulated time, which must be a
+            whole number. Increments remain those of one recorded step; set-points of layout
+            "open-h" are held until the next frame.
         variants: looks in which each demonstration is rendered; None renders each once, as it was
             recorded.
         video: codec of the RGB views, a key of `video.CODECS`; lossless images by default.
@@ -81,7 +82,8 @@ def render_demos(
     Raises:
         UnknownName: a view, codec or layout that does not exist.
         InputError: a folder of demonstrations that is given twice, a size or frame stride that is
-            not allowed, or a video or frame stride that the layout does not support.
+            not allowed, or a video, frame stride or disturbed demonstration that the layout does
+            not support.
         BadFile: `demos` holds no readable demonstrations, or some with another task or scene.
         OutputExists: `out` holds something else.
     """
@@ -106,6 +108,7 @@ def render_demos(
         return finished(out, request, started)
     origins = [_Origin.of(read_demo(path)) for path in paths]
     config = _same_config(origins, paths)
+    _check_labels(origins, paths, layout)
     counts = [len(range(0, origin.length, frame_stride)) for origin in origins]
     if variants:
         config = variants.shown(config)
@@ -204,11 +207,19 @@ class _Origin(NamedTuple):
     scene_hash: str
     demonstrator: str
     code_version: str
+    is_disturbed: bool
 
     @classmethod
     def of(cls, demo: Demo) -> "_Origin":
         """Return a demonstration's origin."""
-        return cls(len(demo), demo.config, demo.scene_hash, demo.demonstrator, demo.code_version)
+        return cls(
+            len(demo),
+            demo.config,
+            demo.scene_hash,
+            demo.demonstrator,
+            demo.code_version,
+            demo.executed is not None,
+        )
 
 
 def _same_config(origins: Sequence[_Origin], paths: Sequence[Path]) -> TaskConfig:
@@ -220,6 +231,19 @@ def _same_config(origins: Sequence[_Origin], paths: Sequence[Path]) -> TaskConfi
     return first.config
 
 
+def _check_labels(origins: Sequence[_Origin], paths: Sequence[Path], layout: str) -> None:
+    """Refuse demonstrations whose labels are not what moved the arms, in a layout of set-points."""
+    if layout == SURGICAI:
+        return
+    for path, origin in zip(paths, origins, strict=True):
+        if origin.is_disturbed:
+            raise InputError(
+                f"In {path} noise, an upset or a learner altered what was executed, and layout "
+                f"'{layout}' holds the set-points that were executed, not the demonstrator's "
+                "labels. Record without disturbance, or use surgicai-vision's own layout."
+            )
+
+
 def _meta(
     sources: Sequence[Path],
     request: Table,
@@ -228,6 +252,7 @@ def _meta(
     origins: Sequence[_Origin],
 ) -> Table:
     """Return the content of `meta/surgicai.json`."""
+    spacing = request.get("frame_stride", 1) * origins[0].config.action_repeat
     return {
         "format": schema.FORMAT,
         "request": request,
@@ -241,7 +266,7 @@ def _meta(
         "units": {"length": "m", "angle": "rad", "depth": "m", "time": "s"},
         "parts": list(names.PARTS),
         **({"variants": request["variants"]["count"]} if "variants" in request else {}),
-        "fps": names.FPS // request.get("frame_stride", 1),
+        "fps": names.FPS // spacing,
         "renderers": sorted({summary["renderer"] for summary in summaries}),
         "scene_hash": origins[0].scene_hash,
         "demonstrators": sorted({origin.demonstrator for origin in origins}),

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.store import Demo
 
 Table = Mapping[str, Any]
@@ -122,6 +123,25 @@ def labels(demo: Demo, frame_stride: int) -> dict[str, NDArray[np.generic]]:
         names.PHASE: demo.phase[::frame_stride].astype(np.int64),
         names.SEED: np.full(frames, demo.seed, np.int64),
     }
+
+
+def check_spacing(frame_stride: int, action_repeat: int) -> None:
+    """Refuse frames of which there would be no whole number in a second.
+
+    Args:
+        frame_stride: recorded steps from frame to frame.
+        action_repeat: control steps of a recorded step.
+
+    Raises:
+        InputError: their product does not divide `names.FPS`.
+    """
+    spacing = frame_stride * action_repeat
+    if names.FPS % spacing:
+        raise InputError(
+            f"frame_stride is {frame_stride} and action_repeat {action_repeat}: the dataset would "
+            f"have a frame every {spacing} control steps, which must divide the {names.FPS} of a "
+            "second. Give another frame_stride, or record with another action_repeat."
+        )
 
 
 def column_bytes(key: str, values: NDArray[np.generic]) -> bytes:

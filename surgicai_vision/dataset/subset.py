@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, digest
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
+from surgicai_vision.core.runs import first_of_group
 from surgicai_vision.dataset.protocol import Dataset, episode_bounds
 
 
@@ -68,10 +69,10 @@ def with_frame_stride(dataset: Dataset, frame_stride: int) -> Dataset:
     stride = frame_stride // held
     if stride == 1:
         return dataset
-    index = dataset.episode_index
-    position = np.arange(len(index)) - np.searchsorted(index, index, side="left")
+    position = np.arange(dataset.length) - first_of_group(dataset.episode_index)
     rows = np.flatnonzero(position % stride == 0)
-    return DatasetSubset(dataset, rows, {"frame_stride": stride}, fps=dataset.fps // stride)
+    fps = max(dataset.fps // stride, 1)
+    return DatasetSubset(dataset, rows, {"frame_stride": stride}, fps=fps)
 
 
 def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
@@ -124,7 +125,7 @@ class DatasetSubset:
         path, views, policy_views, image_size: those of the whole.
         config: configuration of the task.
         task: name of the task.
-        fps: frames per second of simulated time.
+        fps: frames per second of simulated time, rounded down, at least 1.
         length: N.
     """
 

@@ -68,12 +68,16 @@ def encode_views(
     """
     bounds = dataset.bounds()
     blocks = _blocks(bounds)
-    same = {"dataset": str(dataset.path.resolve()), "video": video}
+    same = {
+        "dataset": str(dataset.path.resolve()),
+        "digest": dataset.meta["digest"],
+        "video": video,
+    }
     jobs = [
         Job(
             "encode-video",
             {**same, "view": view, "first": first, "stop": stop},
-            (dataset.meta["digest"],),
+            (),
             bounds[stop - 1][1] - bounds[first][0],
             ("dataset",),
         )
@@ -109,14 +113,17 @@ def _blocks(bounds: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 @functools.lru_cache(maxsize=1)
-def _dataset(folder: str) -> RenderedDataset:
+def _dataset(folder: str, digest: str) -> RenderedDataset:
+    """Open the dataset of this digest in a folder; another one there is opened anew."""
     return open_dataset(Path(folder))
 
 
 @job("encode-video", stages=("dataset",), packages=("numpy", "av"))
-def encode_block(folder: Path, dataset: str, video: str, view: str, first: int, stop: int) -> None:
+def encode_block(
+    folder: Path, dataset: str, digest: str, video: str, view: str, first: int, stop: int
+) -> None:
     """Encode a view of the episodes first … stop - 1 and compare each frame with its image."""
-    data = _dataset(dataset)
+    data = _dataset(dataset, digest)
     key = names.image_key(view)
     path = folder / VIDEO_FILE
     bounds = data.bounds()[first:stop]
@@ -128,10 +135,10 @@ def encode_block(folder: Path, dataset: str, video: str, view: str, first: int, 
     rows = []
     decoded = read_frames(path, 0, end - begin, data.fps)
     for low, high in bounds:
-        digest = schema.ImageDigest()
+        shown = schema.ImageDigest()
         error = 0.0
         for before, after in zip(data.decoded(key, low, high), decoded, strict=False):
             error += float(np.abs(after.astype(np.int16) - before).mean())
-            digest.add(after)
-        rows.append({"digest": digest.hexdigest(), "error": error})
+            shown.add(after)
+        rows.append({"digest": shown.hexdigest(), "error": error})
     write_json(folder / COMPARISON_FILE, rows)

@@ -12,14 +12,20 @@ A visit that was broken off is kept up to the last contact of the jaws with the 
 the demonstrator had not yet noticed the loss (`record-demos --late`). Visits of fewer than
 `SHORTEST` steps are left out.
 
+Reward and success are the subtask's own, measured anew in the recorded states; in a recording of
+the procedure, success is that of the whole procedure.
+
 The folder is written atomically; repeating the same request reuses it.
 """
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, check_name
@@ -85,6 +91,9 @@ def visits(demo: Demo, subtask: str) -> list[Demo]:
     """Return a subtask's visits in a whole procedure, each as a demonstration of the subtask.
 
     A visit's configuration is the procedure's, with the subtask's name and step limit.
+
+    Raises:
+        InputError: the procedure was recorded in a scene that is compiled differently now.
     """
     config = dataclasses.replace(demo.config, task=subtask, max_steps=TaskConfig(subtask).max_steps)
     number = names.SUBTASKS.index(subtask)
@@ -93,21 +102,53 @@ def visits(demo: Demo, subtask: str) -> list[Demo]:
         for first, end in runs_of(demo.phase)
         if demo.phase[first] == number
     ]
-    return [
-        dataclasses.replace(
+    cut = []
+    for first, end in found:
+        if end - first < SHORTEST:
+            continue
+        state = demo.state[first : end + 1]
+        reward, success = _measured(_env(config, demo.scene_hash), state[1:])
+        visit = dataclasses.replace(
             demo,
             config=config,
-            state=demo.state[first : end + 1],
+            state=state,
             action=demo.action[first:end],
             phase=demo.phase[first:end],
-            reward=demo.reward[first:end],
-            success=demo.success[first:end],
+            reward=reward,
+            success=success,
             contact=demo.contact[first:end],
             executed=None if demo.executed is None else demo.executed[first:end],
         )
-        for first, end in found
-        if end - first >= SHORTEST
-    ]
+        cut.append(visit)
+    return cut
+
+
+@functools.lru_cache(maxsize=1)
+def _env(config: TaskConfig, scene_hash: str) -> envs.SuturingEnv:
+    """Return this process's env for `config`; refuse a scene other than that of `scene_hash`."""
+    env = envs.make(config)
+    if env.scene.hash != scene_hash:
+        raise InputError(
+            f"The procedure was recorded in another scene (hash {scene_hash[:12]}, now "
+            f"{env.scene.hash[:12]}); record it again."
+        )
+    return env
+
+
+def _measured(
+    env: envs.SuturingEnv, state: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return a subtask's reward and success in states (T, n) of the whole procedure, (T,) each."""
+    phase = names.SUBTASKS.index(env.task)
+    rewards = []
+    successes = []
+    for one in state:
+        env.set_state_vector(one)
+        env.simulation.task_state.phase = phase  # the procedure's last step began the next subtask
+        info = env.measure()
+        rewards.append(env.reward(info))
+        successes.append(info["is_success"])
+    return np.array(rewards, np.float32), np.array(successes, bool)
 
 
 def _kept_end(demo: Demo, first: int, end: int) -> int:

@@ -67,7 +67,11 @@ class Disturbance:
             raise InputError(f"late is {self.late}; it must be at least 0 control steps.")
 
     def perturb_start(self, env: "SuturingEnv", rng: np.random.Generator) -> bool:
-        """Move the tool away with the given probability; return False if that ended the episode."""
+        """Move the tool away with the given probability; return False if that ended the episode.
+
+        The episode's steps and path are counted from the moved start: it is where the recording
+        begins, and where a policy's clock does.
+        """
         if rng.random() >= self.perturb_start_fraction:
             return True
         direction = np.append(rng.uniform(-1.0, 1.0, 6), 0.0).astype(np.float32)
@@ -75,6 +79,9 @@ class Disturbance:
             _, _, terminated, truncated, _ = env.step(direction)
             if terminated or truncated:
                 return False
+        state = env.simulation.task_state
+        state.steps = 0
+        state.tip_path = 0.0
         return True
 
     def draw_deviation(self, rng: np.random.Generator) -> float:

@@ -277,8 +277,7 @@ def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: flo
         return ToolTarget(goal, 0.0)
     if lined_up and not closing:
         return ToolTarget(goal, opened)
-    retreat = min(depth, -back) if not lined_up and depth > -back else -back
-    return ToolTarget(_shifted(goal, retreat * axis), opened)
+    return ToolTarget(_shifted(goal, -back * axis), opened)
 
 
 def _grasp(world: WorldState) -> ToolTarget:

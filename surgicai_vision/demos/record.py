@@ -48,6 +48,7 @@ from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance, check_la
 from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import (
     MARKER,
+    is_same_request,
     list_demos,
     read_demo,
     read_marker,
@@ -257,7 +258,7 @@ def finished(out: Path, request: Mapping[str, object]) -> bool:
     """
     if not (out / MARKER).exists():
         return False
-    if read_marker(out).get("request") != request:
+    if not is_same_request(read_marker(out).get("request"), request):
         raise OutputExists(
             f"--out {out} holds demonstrations of another command (see {out / MARKER}); "
             "give another folder."

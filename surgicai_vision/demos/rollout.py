@@ -182,11 +182,15 @@ def rollout(
             executed = disturbance.disturb(label, deviation, rng) if is_noisy else label
         recorder.step(upset.altered(executed), label)
         observation = recorder.observation
-        steps_left -= succeeded
+        if succeeded:
+            steps_left -= 1
         succeeded = succeeded or recorder.success
-        finished = succeeded and steps_left <= 0
-        ended = finished or recorder.truncated or not recorder.is_physical
-        ended = ended or bool(demonstrator.gives_up)
+        ended = (
+            (succeeded and steps_left <= 0)
+            or recorder.truncated
+            or not recorder.is_physical
+            or bool(demonstrator.gives_up)
+        )
 
     with_executed = bool(is_noisy or behaviour or fraction)
     demo = recorder.demo(with_executed, demonstrator.source)

@@ -10,6 +10,7 @@ damaged file raises `BadFile`.
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -218,6 +219,24 @@ def read_marker(folder: Path) -> dict[str, Any]:
         raise BadFile(f"{folder / MARKER} is not of format {FORMAT}.")
     _check_version(folder / MARKER, marker.get("version"))
     return marker
+
+
+def is_same_request(stored: object, request: Mapping[str, object]) -> bool:
+    """Return True if the request stored in a marker is this one.
+
+    A field that `TaskConfig` has gained since the marker was written counts as its default.
+
+    Args:
+        stored: what the marker holds; None if it holds no request.
+        request: in it, "task" is a whole `TaskConfig` as data, if it is a table.
+    """
+    if isinstance(stored, dict) and isinstance(stored.get("task"), dict):
+        try:
+            config = from_mapping(TaskConfig, stored["task"])
+        except InputError:
+            return False
+        stored = {**stored, "task": to_mapping(config)}
+    return stored == request
 
 
 def _check_version(path: Path, version: object) -> None:

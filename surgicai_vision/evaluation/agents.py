@@ -187,6 +187,7 @@ class PolicyAgent(Agent):
         image_size: height and width the policy was trained on [px].
         vector: its inputs besides features, keys of `policies.base.VECTORS`.
         progress: predicts the progress, for a policy with `names.PROGRESS` as an input.
+        action_repeat: control steps for which an action was held in its training.
     """
 
     def __init__(
@@ -198,6 +199,7 @@ class PolicyAgent(Agent):
         image_size: int,
         vector: tuple[str, ...] = (names.STATE,),
         progress: "PolicyAgent | None" = None,
+        action_repeat: int = 1,
     ):
         self.name = name
         self.views = views
@@ -211,6 +213,7 @@ class PolicyAgent(Agent):
         self._told = tuple(VECTORS[key] for key in vector if key in VECTORS)
         self._clocked = names.CLOCK in vector
         self._progress = progress
+        self.action_repeat = action_repeat
         self._ticks: dict[int, int] = {}
         self._shared: FeatureTable | None = None
 
@@ -247,7 +250,7 @@ class PolicyAgent(Agent):
         Args:
             robots: the robots, for proprioception.
             observations: their observations.
-            ticks: control steps since each robot's subtask began, for a policy with a clock.
+            ticks: actions since each robot's subtask began, for a policy with a clock.
         """
         with one_thread():
             vectors = self.vectors(robots, observations, ticks)
@@ -264,7 +267,7 @@ class PolicyAgent(Agent):
             [np.concatenate([told(robot) for told in self._told]) for robot in robots]
         )
         if self._clocked and ticks is not None:
-            clocks = clock(np.array(ticks))
+            clocks = clock(np.array(ticks) * self.action_repeat)
             vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)
         if self._progress is not None:
             said = self._progress.answer(robots, observations)[:, PROGRESS_AT:]

@@ -47,7 +47,7 @@ class _Episode:
 
     Attributes:
         seed: the episode's.
-        tick: control steps since its subtask began.
+        tick: actions since its subtask began.
         past: the last moments, the present one last.
         plans: (tick at which it was made, its actions (chunk, 7)), the oldest first.
     """
@@ -76,6 +76,8 @@ class ChunkAgent(Agent):
         self._policy = policy
         self._senses = senses
         self._sees = bool(senses.views)
+        # Actions, not control steps, from one observation of the history to the next.
+        self._spacing = policy.spacing // senses.action_repeat
         self._episodes: dict[int, _Episode] = {}
 
     def share(self, features: FeatureTable) -> None:
@@ -84,7 +86,7 @@ class ChunkAgent(Agent):
 
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Forget everything; random numbers are drawn from `seed`."""
-        moments = (self._policy.history - 1) * self._policy.spacing + 1
+        moments = (self._policy.history - 1) * self._spacing + 1
         self._episodes[slot] = _Episode(seed, deque(maxlen=moments))
 
     def restart(self, slot: int) -> None:
@@ -112,13 +114,13 @@ class ChunkAgent(Agent):
         return np.stack(actions)
 
     def _is_due(self, tick: int) -> bool:
-        """Return True if a plan is made at `tick`: every `execute` control steps, from 0 on."""
+        """Return True if a plan is made at `tick`: every `execute` actions, from 0 on."""
         return tick % self._policy.execute == 0
 
     def _is_planned_from(self, tick: int) -> bool:
         """Return True if a plan made at `tick` or later sees the observation of `tick`."""
-        policy = self._policy
-        return any(self._is_due(tick + moment * policy.spacing) for moment in range(policy.history))
+        moments = range(self._policy.history)
+        return any(self._is_due(tick + moment * self._spacing) for moment in moments)
 
     def _features(
         self, episodes: Sequence[_Episode], observations: Sequence[Observation]
@@ -158,7 +160,7 @@ class ChunkAgent(Agent):
         """
         past = episode.past
         back = [
-            (len(past) - 1) - moment * self._policy.spacing
+            (len(past) - 1) - moment * self._spacing
             for moment in range(self._policy.history - 1, -1, -1)
         ]
         return [past[max(0, at)] for at in back]

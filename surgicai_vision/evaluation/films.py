@@ -47,7 +47,8 @@ class Look:
     Attributes:
         views: cameras, side by side in this order.
         size: height and width of each view [px], even.
-        every: control steps from one image to the next; 2 gives 25 images per second.
+        every: actions from one image to the next; 2 gives 25 images per second where an action is
+            held for one control step.
         speed: playback speed, as a share of real time; 0.5 is slow motion.
         quality: of the images, "fast" or "high" (ten times slower).
     """
@@ -73,10 +74,9 @@ class Look:
                 "0.01 to 100."
             )
 
-    @property
-    def fps(self) -> float:
-        """Images per second of the video."""
-        return names.FPS / self.every * self.speed
+    def fps(self, action_repeat: int) -> float:
+        """Return a video's images per second, for actions held that many control steps."""
+        return names.FPS / (self.every * action_repeat) * self.speed
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class Filming:
         from surgicai_vision.evaluation.overlay import video_frames  # OpenCV and fonts
 
         frames = video_frames(config, states, moments, title, outcome_of(row), self.look)
-        write_video(self.folder / video_name(row), frames, self.look.fps)
+        write_video(self.folder / video_name(row), frames, self.look.fps(config.action_repeat))
 
     def finish(self, episodes: "Sequence[Episode]") -> None:
         """Write the list of the videos."""
@@ -176,7 +176,7 @@ class Filming:
                 "steps": row.steps,
             }
             for row in rows
-            if (self.folder / video_name(row)).exists()
+            if self.wants(row) and (self.folder / video_name(row)).exists()
         ]
         files.write_json(self.folder / INDEX, {"views": list(self.look.views), "videos": videos})
 

@@ -82,6 +82,9 @@ class _Choice:
 class _Ends(Protocol):
     """When a subtask ends."""
 
+    def advance(self, state: _EpisodeState, robot: Robot) -> None:
+        """Advance the env where a measurement ends the current subtask."""
+
     def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
         """Return True if the high-level policy is to be queried now."""
 
@@ -100,12 +103,13 @@ class _PrivilegedEnds:
     def __init__(self, grasp_hold: int):
         self._grasp_hold = grasp_hold
 
+    def advance(self, state: _EpisodeState, robot: Robot) -> None:
+        """Advance the env from a grasp that has held long enough."""
+        leave_held_grasp(_suture(robot), state.subtask, self._grasp_hold)
+
     def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
-        """Advance the env from a grasp that has held long enough; return True if it advanced."""
-        env = _suture(robot)
-        if state.subtask == env.phase == GRASP and env.dwell >= self._grasp_hold:
-            env.enter(GRASP + 1)
-        return env.phase != state.subtask
+        """Return True if the env has advanced to another subtask."""
+        return _suture(robot).phase != state.subtask
 
     def believes(self, state: _EpisodeState, choice: _Choice) -> bool:
         """Return True: the subtask has ended, whatever comes next."""
@@ -123,6 +127,9 @@ class _LearnedEnds:
     def __init__(self, config: HierarchicalConfig):
         self._config = config
 
+    def advance(self, state: _EpisodeState, robot: Robot) -> None:
+        """Nothing to advance: no measurement ends a subtask."""
+
     def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
         """Return True every `decide_every` steps."""
         return state.steps % self._config.decide_every == 0
@@ -135,6 +142,39 @@ class _LearnedEnds:
         state.times = state.times + 1 if choice.subtask == state.named else 1
         state.named = choice.subtask
         return state.times >= self._config.patience
+
+
+def leave_held_grasp(env: "Suture", subtask: int, grasp_hold: int) -> None:
+    """Enter the subtask after the grasp, if the grasp is the current subtask and has held.
+
+    Args:
+        env: the whole procedure.
+        subtask: the subtask whose policy acts.
+        grasp_hold: control steps for which a grasp must hold.
+    """
+    if subtask == env.phase == GRASP and env.dwell >= grasp_hold:
+        env.enter(GRASP + 1)
+
+
+def common_images(agents: Sequence[Agent]) -> tuple[tuple[str, ...], int]:
+    """Return the cameras of an env in which all of these agents act, and its image size [px].
+
+    Raises:
+        InputError: an agent gives set-points of both arms, or they see images of several sizes.
+    """
+    if any(agent.action_mode != names.INCREMENTS for agent in agents):
+        raise InputError(
+            "A low-level policy moves the active arm by increments, but one of these gives "
+            "set-points of both arms; evaluate that one by itself."
+        )
+    sizes = {agent.image_size for agent in agents if agent.cameras}
+    if len(sizes) > 1:
+        raise InputError(
+            f"The policies see images of {sorted(sizes)} pixels; give policies with one image size."
+        )
+    seen = {camera for agent in agents for camera in agent.cameras}
+    cameras = tuple(camera for camera in camera_names() if camera in seen)
+    return cameras, sizes.pop() if sizes else Agent.image_size
 
 
 @final
@@ -163,23 +203,9 @@ class HierarchicalAgent(Agent):
         self._high = high() if high is not None else None
         learned = config.termination == "learned"
         self._ends: _Ends = _LearnedEnds(config) if learned else _PrivilegedEnds(config.grasp_hold)
-        if any(agent.action_mode != names.INCREMENTS for agent in self._low):
-            raise InputError(
-                "A low-level policy moves the active arm by increments, but one of these gives "
-                "set-points of both arms; evaluate that one by itself."
-            )
         self._agents = [*self._low, *([self._high] if self._high else [])]
         self.privileged = not learned or any(agent.privileged for agent in self._agents)
-        seen = {camera for agent in self._agents for camera in agent.cameras}
-        self.cameras = tuple(camera for camera in camera_names() if camera in seen)
-        sizes = {agent.image_size for agent in self._agents if agent.cameras}
-        if len(sizes) > 1:
-            raise InputError(
-                f"The policies see images of {sorted(sizes)} pixels; give policies with one image "
-                "size."
-            )
-        if sizes:
-            self.image_size = sizes.pop()
+        self.cameras, self.image_size = common_images(self._agents)
         self._slots: dict[int, _EpisodeState] = {}
         self._features: FeatureTable = {}
         for agent in self._agents:
@@ -235,6 +261,8 @@ class HierarchicalAgent(Agent):
             robots: theirs.
             observations: theirs.
         """
+        for state, robot in zip(states, robots, strict=True):
+            self._ends.advance(state, robot)
         due = [
             self._ends.is_asked(state, robot) or self._is_over(state)
             for state, robot in zip(states, robots, strict=True)

@@ -216,7 +216,8 @@ def video_frames(
             images = {view: draw(states[index], view) for view in look.views}
             if index == last:
                 end = overlay.frame(images, index, outcome)
-                for _ in range(max(1, round(LAST_S * look.fps / look.speed))):
+                held = round(LAST_S * look.fps(config.action_repeat) / look.speed)
+                for _ in range(max(1, held)):
                     yield end
             else:
                 yield overlay.frame(images, index)

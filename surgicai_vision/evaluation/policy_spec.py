@@ -240,10 +240,11 @@ def _replay(dataset: "Dataset") -> PolicySpec:
     Raises:
         InputError: a dataset without a frame of every step.
     """
-    if dataset.fps != names.FPS:
+    needed = names.FPS // dataset.config.action_repeat
+    if dataset.fps != needed:
         raise InputError(
             f"{dataset.path} holds {dataset.fps} frames per second; "
-            f"a replay needs one for each step: {names.FPS}."
+            f"a replay needs one for each step: {needed}."
         )
     actions = mean_demonstration(dataset.columns()[names.ACTION], dataset.episode_index)
     run = RunConfig(dataset.config, policy=REPLAY)
@@ -403,6 +404,7 @@ def _agent_of(policy: "Policy", weights: WeightsSource) -> PolicyAgent:
         checkpoint.image_size,
         policy.inputs.vector or (names.STATE,),
         policy_agent(progress, weights) if progress else None,
+        checkpoint.task.action_repeat,
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core.errors import SurgicaiError
+from surgicai_vision.core.files import FAMILIES, code_version
 
 PACKAGES = (
     "surgicai-vision",
@@ -35,6 +36,11 @@ def provenance(render: bool = True) -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)),
         "renderer": _renderer() if render else None,
     }
+
+
+def episode_code() -> str:
+    """Return the version of all code that an episode depends on, the families' included."""
+    return f"{code_version()} {code_version(*FAMILIES)}"
 
 
 def command_line() -> str:

@@ -5,12 +5,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from surgicai_vision.core.config import digest, to_mapping
-from surgicai_vision.core.files import code_version
 from surgicai_vision.core.progress import Progress, Stage
 from surgicai_vision.evaluation.films import Filming
 from surgicai_vision.evaluation.finished import FOLDER, FinishedEpisodes
 from surgicai_vision.evaluation.policy_spec import PolicySpec
-from surgicai_vision.evaluation.provenance import command_line, provenance
+from surgicai_vision.evaluation.provenance import command_line, episode_code, provenance
 from surgicai_vision.evaluation.rollout import check_seeds, evaluate
 from surgicai_vision.evaluation.storage import (
     MARKER,
@@ -68,7 +67,7 @@ def evaluate_into(
     with alone_in(out):
         finished = None
         if spec.resumes:
-            owner = [to_mapping(run), dict(spec.about), scene_hash, code_version(), repr(filming)]
+            owner = [to_mapping(run), dict(spec.about), scene_hash, episode_code(), repr(filming)]
             finished = FinishedEpisodes(out / FOLDER, digest(owner))
         episodes = evaluate(
             spec.make_agent,

@@ -37,7 +37,12 @@ FILM_FRAMES = 10
 
 @dataclass(frozen=True)
 class Film:
-    """States of one episode: `steps` (k,) and `states` (k, n) for the env's `set_state_vector`."""
+    """States of one episode.
+
+    Attributes:
+        steps: control steps taken before each state, (k,).
+        states: for the env's `set_state_vector`, (k, n).
+    """
 
     steps: NDArray[np.int64]
     states: NDArray[np.float64]
@@ -224,7 +229,6 @@ class Slot:
     def _film(self) -> Film:
         if not self.states:
             return Film(np.zeros(0, np.int64), np.zeros((0, 0)))
-        steps = np.unique(
-            np.linspace(0, len(self.states) - 1, FILM_FRAMES).round().astype(np.int64)
-        )
-        return Film(steps, np.stack([self.states[step] for step in steps]))
+        kept = np.unique(np.linspace(0, len(self.states) - 1, FILM_FRAMES).round().astype(np.int64))
+        steps = np.array([self.moments[index].step for index in kept], np.int64)
+        return Film(steps, np.stack([self.states[index] for index in kept]))

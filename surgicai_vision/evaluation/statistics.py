@@ -109,27 +109,49 @@ def hierarchical_bootstrap(
         )
     if resamples < 100:
         raise InputError(f"resamples is {resamples}; it must be at least 100.")
-    rates, single = all(np.isin(seed, (0.0, 1.0)).all() for seed in seeds), len(seeds) == 1
-    if rates and single:
+    are_rates = all(np.isin(seed, (0.0, 1.0)).all() for seed in seeds)
+    is_single = len(seeds) == 1
+    if are_rates and is_single:
         return _beta_bounds(float(seeds[0].sum()), seeds[0].size, level)
     # With one seed, its episodes are the independent units.
-    units = [seeds[0][[episode]] for episode in range(seeds[0].size)] if single else seeds
-    mean, error = (
-        float(np.mean([unit.mean() for unit in units])),
-        _bootstrap_error(units, generator, resamples),
-    )
-    if not rates:
-        count = len(units)
-        half = (
-            _student(level, count - 1) * error * math.sqrt(count / (count - 1))
-            if count > 1
-            else math.inf
-        )
-        return mean - half, mean + half
-    trials = sum(seed.size for seed in seeds)
-    worth = min(trials, mean * (1 - mean) / error**2) if error > 0 else trials
-    worth *= (_student(level, trials - 1) / _student(level, len(seeds) - 1)) ** 2
-    return _beta_bounds(mean * worth, worth, level)
+    units = [seeds[0][[episode]] for episode in range(seeds[0].size)] if is_single else seeds
+    mean = float(np.mean([unit.mean() for unit in units]))
+    error = _bootstrap_error(units, generator, resamples)
+    if are_rates:
+        return _rate_bounds(mean, error, len(seeds), sum(seed.size for seed in seeds), level)
+    return _mean_bounds(mean, error, len(units), level)
+
+
+def _rate_bounds(
+    rate: float, error: float, seeds: int, episodes: int, level: float
+) -> tuple[float, float]:
+    """Return Korn and Graubard's interval of a success rate; see `hierarchical_bootstrap`.
+
+    Args:
+        rate: the mean of the seeds' rates.
+        error: its standard error.
+        seeds: number of training seeds, at least 2.
+        episodes: number of episodes in all.
+        level: coverage, between 0 and 1.
+    """
+    worth = min(episodes, rate * (1 - rate) / error**2) if error > 0 else episodes
+    worth *= (_student(level, episodes - 1) / _student(level, seeds - 1)) ** 2
+    return _beta_bounds(rate * worth, worth, level)
+
+
+def _mean_bounds(mean: float, error: float, units: int, level: float) -> tuple[float, float]:
+    """Return Student's interval of a mean; see `hierarchical_bootstrap`.
+
+    Args:
+        mean: the mean of the independent units.
+        error: its standard error by the bootstrap.
+        units: their number; the interval of a single one is infinite.
+        level: coverage, between 0 and 1.
+    """
+    if units == 1:
+        return -math.inf, math.inf
+    half = _student(level, units - 1) * error * math.sqrt(units / (units - 1))
+    return mean - half, mean + half
 
 
 def _bootstrap_error(groups: list[Array], generator: np.random.Generator, resamples: int) -> float:

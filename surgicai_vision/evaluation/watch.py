@@ -207,7 +207,7 @@ class Player:
         self._message = f"{outcome_of(row).capitalize()}."
         if row.error:
             self._message = f"{self._message[:-1]}: {row.error}"
-        if self._episodes is not None and self.number >= self._episodes:
+        if self._episodes is not None and len(self.rows) >= self._episodes:
             self._stop(f"{self._message} That was the last.")
 
     def _stop(self, message: str) -> None:

@@ -125,10 +125,10 @@ def sew(
         total = len(slot.states) // LOOK.every
         with stage("filming", "images") as progress:
             frames = _counted(_with_poster(frames, out / POSTER), progress, total)
-            write_video(out / VIDEO, frames, LOOK.fps)
+            fps = LOOK.fps(sewer.spec.config.action_repeat)
+            write_video(out / VIDEO, frames, fps)
         moving = read_video(out / VIDEO)[::MOVING_EVERY]
-        fps = LOOK.fps / MOVING_EVERY
-        write_animation(out / MOVING, moving, fps, MOVING_QUALITY, MOVING_EFFORT)
+        write_animation(out / MOVING, moving, fps / MOVING_EVERY, MOVING_QUALITY, MOVING_EFFORT)
         _strip(sewer, slot.states, shown.ends, out / STRIP)
     finally:
         slot.env.close()

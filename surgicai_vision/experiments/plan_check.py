@@ -16,6 +16,7 @@ from surgicai_vision.experiments.dataset_config import (
 )
 from surgicai_vision.experiments.plan_parts import HLP, PARTS, Condition, PlannedPolicy
 from surgicai_vision.features import encoders
+from surgicai_vision.training.run_config import RunConfig
 
 if TYPE_CHECKING:
     from surgicai_vision.experiments.plan_config import Plan
@@ -54,11 +55,7 @@ def check_plan(plan: "Plan") -> None:
         _check_learner(plan, recorded)
     for condition in plan.conditions:
         _check_condition(plan, condition)
-    if len(set(plan.runs)) != len(plan.runs):
-        raise InputError(
-            f"The plan has {len(plan.runs)} runs, {len(set(plan.runs))} of them different; "
-            "leave out policies that differ only in their names."
-        )
+    _check_runs(plan)
 
 
 def _check_env(where: str, env: Mapping[str, JSON], done: str) -> None:
@@ -165,6 +162,19 @@ def _check_condition(plan: "Plan", condition: Condition) -> None:
             raise InputError(
                 f"condition {condition.name}: strength is {condition.shift.strength}; "
                 "allowed: 0 to 1."
+            )
+
+
+def _check_runs(plan: "Plan") -> None:
+    """Refuse policies whose runs are equal: the results of one would stand for the other's."""
+    evaluated: dict[RunConfig, str] = {}
+    for run, name, _ in plan.evaluations():
+        first = evaluated.setdefault(run, name)
+        if first != name:
+            raise InputError(
+                f"policies '{first}' and '{name}' have the same run, which records neither their "
+                "names nor everything about their demonstrations (jaw_noise, upset_fraction, "
+                "late, …); evaluate one of them in another plan."
             )
 
 

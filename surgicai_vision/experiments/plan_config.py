@@ -47,7 +47,7 @@ each seed demonstrations that no other seed has. None of them begins at a start 
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -292,7 +292,10 @@ class Plan:
     @functools.cached_property
     def _evaluated(self) -> dict[RunConfig, tuple[str, Condition]]:
         """Each run → the name of what is evaluated, and the condition."""
-        found: dict[RunConfig, tuple[str, Condition]] = {}
+        return {run: (name, condition) for run, name, condition in self.evaluations()}
+
+    def evaluations(self) -> Iterator[tuple[RunConfig, str, Condition]]:
+        """Yield each run with the name of what is evaluated, and the condition."""
         evaluated = [*self.evaluated_names]
         evaluated += [names.SUTURE] if names.SUTURE in self.names else []
         for seed in self.seed:
@@ -300,8 +303,7 @@ class Plan:
                 if condition.seed and seed not in condition.seed:
                     continue
                 for name in condition.policies or evaluated:
-                    found[self._run(name, condition, seed)] = (name, condition)
-        return found
+                    yield self._run(name, condition, seed), name, condition
 
     @functools.cached_property
     def _listed(self) -> dict[RunConfig, str]:

@@ -21,6 +21,8 @@ from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.percentages import interval
 from surgicai_vision.core.progress import timed
 from surgicai_vision.dataset import open_dataset
+from surgicai_vision.dataset.layouts import SURGICAI
+from surgicai_vision.dataset.render import check_request
 from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.provenance import command_line, provenance
@@ -58,10 +60,11 @@ def run_quickstart(
 
     Raises:
         MissingWeights: an encoder's weights are not at hand; before any work.
-        InputError: this machine cannot render images; before any work.
+        InputError: images that cannot be rendered, or not on this machine; before any work.
         UnknownName: a recipe that does not exist; before any work.
         OutputExists: `out` holds something else.
     """
+    check_request(plan.view, plan.size, plan.frame_stride, None, SURGICAI)
     for run in plan.runs:
         policies.recipe_of(run)
         if run.encoder:

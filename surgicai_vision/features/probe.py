@@ -37,6 +37,8 @@ PENALTIES = np.logspace(-7, 2, 28)
 """Tried penalties, as shares of the features' total variance."""
 SMALLEST_STD = 1e-6  # a feature that varies less counts as constant
 RESAMPLES = 10_000
+SHAPE_AXES = ("needle_arc", "needle_size")
+"""Axes of randomisation that move the tip relative to the needle's pose."""
 
 Array = NDArray[np.float64]
 
@@ -101,8 +103,8 @@ def probe(
 
     Raises:
         UnknownName: a dataset without the needle's pose.
-        InputError: fewer than `FEWEST` episodes, a pose that is not finite, or features of another
-            dataset.
+        InputError: a dataset that `needle_pose` refuses, features of another dataset, or nothing
+            to probe.
     """
     pose = needle_pose(dataset)
     if not features and not proprioception:
@@ -171,7 +173,8 @@ def needle_pose(dataset: Dataset) -> Array:
 
     Raises:
         UnknownName: a dataset without the needle's pose.
-        InputError: fewer than `FEWEST` episodes, or a pose that is not finite.
+        InputError: fewer than `FEWEST` episodes, a pose that is not finite, or needles of several
+            shapes, whose tips no column tells.
     """
     columns = dataset.columns()
     if names.NEEDLE_POSE not in columns:
@@ -183,6 +186,12 @@ def needle_pose(dataset: Dataset) -> Array:
     if not np.isfinite(pose).all():
         raise InputError(
             f"Column '{names.NEEDLE_POSE}' of the dataset holds values that are not finite."
+        )
+    varied = [axis for axis in SHAPE_AXES if axis in dataset.config.randomisation.on]
+    if varied:
+        raise InputError(
+            f"The needle's shape varies in the dataset ({', '.join(varied)}), and no column tells "
+            "where the tip is; probe a dataset without these axes of randomisation."
         )
     return pose
 

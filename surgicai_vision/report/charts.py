@@ -67,6 +67,34 @@ class Series:
 
 
 @dataclass(frozen=True)
+class Frame:
+    """Where a chart's points are in its drawing.
+
+    Attributes:
+        first: the smallest x.
+        last: the largest x.
+        logarithmic: whether the x axis is logarithmic; every x is then above 0.
+    """
+
+    first: float
+    last: float
+    logarithmic: bool = False
+
+    def across(self, x: float) -> float:
+        """Return the horizontal position of x."""
+        low, high = self._scaled(self.first), self._scaled(self.last)
+        span = (high - low) or 1.0
+        return LEFT + (WIDTH - LEFT - RIGHT) * (self._scaled(x) - low) / span
+
+    def down(self, rate: float) -> float:
+        """Return the vertical position of a rate, from the top."""
+        return TOP + (HEIGHT - TOP - BOTTOM) * (1 - rate)
+
+    def _scaled(self, x: float) -> float:
+        return math.log(x) if self.logarithmic else x
+
+
+@dataclass(frozen=True)
 class Bar:
     """A share, optionally a second one with its bounds, and the text as in `Point`."""
 
@@ -215,16 +243,8 @@ def curves(
     """
     xs = sorted({point.x for line in series for point in line.points})
     marks = xs if ticks or logarithmic else _marks(xs)
-    scale = math.log if logarithmic else float
-    low, high = scale(xs[0]), scale(xs[-1])
-    span = (high - low) or 1.0
-
-    def place(x: float, rate: float) -> tuple[float, float]:
-        return LEFT + (WIDTH - LEFT - RIGHT) * (scale(x) - low) / span, TOP + (
-            HEIGHT - TOP - BOTTOM
-        ) * (1 - rate)
-
-    parts = [_axes(marks, place, x_name, ticks or {})]
+    frame = Frame(xs[0], xs[-1], logarithmic)
+    parts = [_axes(marks, frame, x_name, ticks or {})]
     for index, line in enumerate(series):
         shift = (
             3.0 * (index - (len(series) - 1) / 2) / max(1, len(series) - 1)
@@ -232,7 +252,7 @@ def curves(
             else 0.0
         )
         if line.points:
-            parts.append(_line(line, index, shift if joined else 0.0, place, joined))
+            parts.append(_line(line, index, shift if joined else 0.0, frame, joined))
     body = "".join(parts)
     return Markup(
         f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img"'
@@ -268,11 +288,11 @@ def _marks(xs: Sequence[float]) -> list[float]:
     return [round(step * index, 9) for index in range(first, last + 1)]
 
 
-def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float, str]) -> str:
-    assert callable(place)
+def _axes(xs: Sequence[float], frame: Frame, x_name: str, ticks: Mapping[float, str]) -> str:
+    """Draw the grid of rates, and the marks below the x axis as far as there is room."""
     parts = []
     for rate in (0.0, 0.25, 0.5, 0.75, 1.0):
-        y = place(xs[0], rate)[1]
+        y = frame.down(rate)
         parts.append(
             f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
         )
@@ -281,7 +301,7 @@ def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float,
         )
     last = -1e9
     for x in xs:
-        at = place(x, 0.0)[0]
+        at = frame.across(x)
         if at - last < 26:
             continue
         last = at
@@ -297,20 +317,19 @@ def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float,
     return "".join(parts)
 
 
-def _line(line: Series, index: int, shift: float, place: object, with_path: bool) -> str:
+def _line(line: Series, index: int, shift: float, frame: Frame, with_path: bool) -> str:
     """Draw one series.
 
     `shift` moves it sideways, so that intervals at the same x do not overlap.
     """
-    assert callable(place)
     colour = COLOURS[index % len(COLOURS)]
     path = []
     parts = []
     for point in line.points:
-        x, y = place(point.x, point.rate)
-        top = place(point.x, point.high)[1]
-        bottom = place(point.x, point.low)[1]
-        x += shift
+        x = frame.across(point.x) + shift
+        y = frame.down(point.rate)
+        top = frame.down(point.high)
+        bottom = frame.down(point.low)
         path.append(f"{x:.1f},{y:.1f}")
         bar = (
             f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{top:.1f}" y2="{bottom:.1f}" stroke-width="1.6"'

@@ -1,6 +1,6 @@
 """Curves: success against demonstrations, training and shift strength, and over the procedure."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from markupsafe import Markup
@@ -10,7 +10,7 @@ from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Point, Series
-from surgicai_vision.report.experiment_key import Condition
+from surgicai_vision.report.experiment_key import Condition, labels
 from surgicai_vision.report.groups import Group
 
 MOST = len(charts.COLOURS)
@@ -84,7 +84,7 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
             members = _by_condition(with_zero(mine, axis), base_of)
             lines = _series(members, lambda item: item.condition.strength)
             if lines:
-                areas = {base.label: _area(items) for base, items in members.items()}
+                areas = {base: _area(members[base]) for base in lines}
                 title = f"{task}: {axis.replace('_', ' ')}"
                 found.append(_chart(title, lines, "strength", extra=("area (interval)", areas)))
     return found
@@ -140,13 +140,16 @@ def _by_condition(
     return found
 
 
-def _series(members: dict[Condition, list[Group]], x: Callable[[Group], float]) -> list[Series]:
-    """Join groups into lines; a single point is not a curve."""
-    found = []
+def _series(
+    members: dict[Condition, list[Group]], x: Callable[[Group], float]
+) -> dict[Condition, Series]:
+    """Join groups into lines, by what is the same along each; a single point is not a curve."""
+    label_of = labels(members)
+    found = {}
     for condition, items in members.items():
         points = tuple(_point(x(item), item) for item in sorted(items, key=x))
         if len({point.x for point in points}) > 1:
-            found.append(Series(condition.label, points))
+            found[condition] = Series(label_of[condition], points)
     return found
 
 
@@ -162,21 +165,23 @@ def _point(x: float, item: Group) -> Point:
 
 def _chart(
     title: str,
-    lines: list[Series],
+    series: Mapping[Condition, Series],
     x_name: str,
     *,
     logarithmic: bool = False,
-    extra: tuple[str, dict[str, str]] | None = None,
+    extra: tuple[str, Mapping[Condition, str]] | None = None,
 ) -> Chart:
+    """Draw lines, with the numbers of each and, in a column of its own, an extra one."""
+    lines = list(series.values())
     xs = sorted({point.x for line in lines for point in line.points})
     rows = []
-    for line in lines:
+    for condition, line in series.items():
         known = {point.x: point.text for point in line.points}
         rows.append(
             (
                 line.name,
                 *(known.get(x, text.ABSENT) for x in xs),
-                *((extra[1][line.name],) if extra else ()),
+                *((extra[1][condition],) if extra else ()),
             )
         )
     drawn = lines[:MOST]

@@ -1,17 +1,30 @@
 """The key of an experiment: what was evaluated, except for the training seed."""
 
+import itertools
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from surgicai_vision.core.banks import HELD_OUT
 from surgicai_vision.core.cameras import view_names
-from surgicai_vision.core.config import read_changes, world_text
+from surgicai_vision.core.config import TaskConfig, read_changes, world_text
 from surgicai_vision.core.tasks import task_names
+from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.training.run_config import BUDGET, RunConfig
 
 USUAL = "the usual world"
 """The name of a world in which nothing varies."""
+RULES = (
+    "step",
+    "tolerance",
+    "max_steps",
+    "action_repeat",
+    "hold_jaw",
+    "end_on_drop",
+    "advance",
+)
+"""Fields of `TaskConfig` that decide what an action does and when an episode ends or succeeds."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +46,15 @@ class Condition:
         looks: the looks in which each demonstration was rendered, or "".
         multiplied_from: how many demonstrations those were re-posed from; None if they were not.
         dagger_rounds: rounds of DAgger that those include.
+        demonstrator: who demonstrated; "" if not known.
+        noise: strength of the disturbance of the demonstrator's executed actions.
+        budget: updates or control steps that the training was given, or "".
         world: what differs from the usual in the world of the evaluation, before a shift; "" if
             nothing does.
         recorded_in: the same for the demonstrations' world, if it is a different one; else "". Also
             "" for a hierarchical policy, each of whose parts has its own.
+        rules: the `RULES` of the evaluation that differ from the task's, each with its value; "" if
+            none does.
         axis: what is shifted in a robustness evaluation, or "".
         strength: how much it is shifted.
         expert_swap: subtask of a hierarchical policy in which the expert acts, or "".
@@ -61,8 +79,12 @@ class Condition:
     looks: str = ""
     multiplied_from: int | None = None
     dagger_rounds: int = 0
+    demonstrator: str = ""
+    noise: float = 0.0
+    budget: str = ""
     world: str = ""
     recorded_in: str = ""
+    rules: str = ""
     axis: str = ""
     strength: float = 0.0
     expert_swap: str = ""
@@ -94,18 +116,44 @@ class Condition:
             self.looks,
             f"multiplied from {self.multiplied_from}" if self.multiplied_from else "",
             f"rounds of DAgger: {self.dagger_rounds}" if self.dagger_rounds else "",
-            f"demonstrated in {self.recorded_in}" if self.recorded_in else "",
-            f"in {self.world}" if self.world and not self.name else "",
-            self.name,
-            "" if self.is_held_out else f"{self.starts} starts",
+            *self.surroundings,
             self.place,
         )
         return tuple(part for part in parts if part)
 
     @property
+    def surroundings(self) -> tuple[str, ...]:
+        """Everything unusual about where it learned and was evaluated; a name says which world."""
+        parts = (
+            f"demonstrated in {self.recorded_in}" if self.recorded_in else "",
+            f"in {self.world}" if self.world and not self.name else "",
+            f"with {self.rules}" if self.rules and not self.name else "",
+            self.name,
+            "" if self.is_held_out else f"{self.starts} starts",
+        )
+        return tuple(part for part in parts if part)
+
+    @property
+    def details(self) -> tuple[str, ...]:
+        """What the label may leave out, each in words or "", in the same order for all."""
+        return (
+            "" if self.demonstrations is None else f"{self.demonstrations} demonstrations",
+            f"demonstrated by {self.demonstrator}" if self.demonstrator else "",
+            f"noise {self.noise:g}",
+            self.budget,
+            f"in {self.world or USUAL}",
+            f"with {self.rules}" if self.rules else "",
+        )
+
+    @property
     def is_held_out(self) -> bool:
         """Whether it was evaluated on starts that no part of the policy has met."""
         return self.starts == HELD_OUT
+
+    @property
+    def is_as_published(self) -> bool:
+        """Whether starts are held out, and world and rules the usual ones, as in the paper."""
+        return self.is_held_out and not (self.world or self.recorded_in or self.rules)
 
     @property
     def variant(self) -> str:
@@ -180,7 +228,11 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         looks=run.variants.text if run.variants else "",
         multiplied_from=run.multiplied_from,
         dagger_rounds=run.dagger_rounds,
+        demonstrator=run.demonstrator or "",
+        noise=run.noise,
+        budget=_budget(run),
         **_worlds(run),
+        rules=_rules(run),
         axis=run.shift.axis if run.shift else "",
         strength=run.shift.strength if run.shift else 0.0,
         expert_swap=run.expert_swap or "",
@@ -206,8 +258,61 @@ def _worlds(run: RunConfig) -> dict[str, str]:
     }
 
 
+def _budget(run: RunConfig) -> str:
+    """Return the updates or control steps that a run's training was given.
+
+    Control steps of a correction and of a high-level policy are measured, not given: they differ
+    between training seeds.
+    """
+    if run.updates is not None:
+        return f"{run.updates:,} updates"
+    return f"{run.env_steps:,} control steps" if run.env_steps and run.algo in ALGORITHMS else ""
+
+
+def _rules(run: RunConfig) -> str:
+    """Return the `RULES` of a run's env that differ from its task's, each with its value.
+
+    A hierarchical policy brings its own step limit, and its own `advance`.
+    """
+    usual = TaskConfig(run.task)
+    own = ("max_steps", "advance") if run.is_hierarchical else ()
+    return ", ".join(
+        f"{rule} {getattr(run.env, rule)}"
+        for rule in RULES
+        if rule not in own and getattr(run.env, rule) != getattr(usual, rule)
+    )
+
+
+def distinctions(conditions: Iterable[Condition]) -> dict[Condition, str]:
+    """Return the details in which each condition differs from those of its task with its label.
+
+    They are "" for a condition whose label no other one of its task has.
+    """
+    alike: dict[tuple[str, str], list[Condition]] = {}
+    for condition in conditions:
+        alike.setdefault((condition.task, condition.label), []).append(condition)
+    found = {}
+    for same in alike.values():
+        columns = zip(*(condition.details for condition in same), strict=True)
+        differs = [len(set(column)) > 1 for column in columns]
+        for condition in same:
+            words = itertools.compress(condition.details, differs)
+            found[condition] = ", ".join(filter(None, words))
+    return found
+
+
+def labels(conditions: Iterable[Condition]) -> dict[Condition, str]:
+    """Return the label of each condition, with its details where others have that label too."""
+    return {
+        condition: ", ".join(filter(None, (condition.label, details)))
+        for condition, details in distinctions(conditions).items()
+    }
+
+
 type Text = tuple[tuple[str, float], ...]
-type Order = tuple[int, bool, bool, Text, int, list[int], Text, int, str, float, str, bool]
+type Order = tuple[
+    int, bool, bool, Text, int, list[int], Text, int, str, float, str, bool, tuple[str, ...]
+]
 
 
 def order(condition: Condition) -> Order:
@@ -234,6 +339,7 @@ def order(condition: Condition) -> Order:
         condition.strength,
         condition.expert_swap,
         condition.upset,
+        condition.details,
     )
 
 

@@ -63,11 +63,12 @@ def markdown(groups: Sequence[Group], title: str) -> str:
         "",
         *_markdown(HEAD, [_record(item) for item in groups]),
     ]
-    missing = [cell for item in groups for cell in item.missing]
-    if missing:
-        lines = [
-            (c.condition.task, c.condition.label, str(c.seed), c.state, c.reason) for c in missing
-        ]
+    lines = [
+        (item.condition.task, item.label, str(cell.seed), cell.state, cell.reason)
+        for item in groups
+        for cell in item.missing
+    ]
+    if lines:
         parts += ["Cells without a result.", ""]
         parts += _markdown(("task", "policy", "training seed", "state", "reason"), lines)
     return "\n".join(parts).rstrip() + "\n"
@@ -119,7 +120,7 @@ def _record(item: Group) -> tuple[str, ...]:
 
 def _policy(item: Group) -> str:
     condition = item.condition
-    parts = [condition.policy] + ([item.demonstrations] if item.several else [])
+    parts = [condition.policy] + ([item.details] if item.details else [])
     parts += [f"{condition.axis} {condition.strength:g}"] if condition.axis else []
     parts += [f"expert in {condition.expert_swap}"] if condition.expert_swap else []
     parts += ["each episode upset"] if condition.upset else []

@@ -5,9 +5,8 @@ seeds: mean ± standard deviation of the cells' rates, and a hierarchical bootst
 (training seeds, then episodes).
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +16,7 @@ from surgicai_vision.core import percentages
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.report import text
-from surgicai_vision.report.experiment_key import Condition, order
+from surgicai_vision.report.experiment_key import Condition, distinctions, order
 from surgicai_vision.report.reader import Collected, Missing, Result
 
 MEASURES = (
@@ -63,18 +62,13 @@ class Group:
     condition: Condition
     results: tuple[Result, ...] = ()
     missing: tuple[Missing, ...] = ()
-    several: bool = False
-    """Whether another condition differs from it only in the number of demonstrations."""
-
-    @property
-    def demonstrations(self) -> str:
-        """The number of demonstrations, if it distinguishes the condition from another."""
-        return f"{self.condition.demonstrations} demonstrations" if self.several else ""
+    details: str = ""
+    """What distinguishes it from another condition of its task with the same label, or ""."""
 
     @property
     def label(self) -> str:
         """The condition with everything that distinguishes it from others of its task."""
-        return self.condition.label + (f", {self.demonstrations}" if self.several else "")
+        return ", ".join(filter(None, (self.condition.label, self.details)))
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
@@ -159,13 +153,13 @@ def group(collected: Collected) -> list[Group]:
     """Return one group for each condition, in the order of the results."""
     conditions = {result.condition for result in collected.results}
     conditions |= {cell.condition for cell in collected.missing}
-    alike = Counter(replace(condition, demonstrations=None) for condition in conditions)
+    details = distinctions(conditions)
     return [
         Group(
             condition,
             tuple(result for result in collected.results if result.condition == condition),
             tuple(cell for cell in collected.missing if cell.condition == condition),
-            alike[replace(condition, demonstrations=None)] > 1,
+            details[condition],
         )
         for condition in sorted(conditions, key=order)
     ]

@@ -3,7 +3,7 @@
 Trained conditions of a task are compared if they differ in one thing (`FACTORS`). Some things count
 as one together with what belongs to them:
 
-* recipes, each with its encoder, views and demonstrations;
+* recipes, each with its encoder, views, budget and demonstrations;
 * multiplied demonstrations, against the few they were made from;
 * demonstrations and looks, each with the epochs trained on them;
 * conditions of a plan, each with how its subtasks end;
@@ -39,8 +39,12 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "looks": "looks",
         "multiplied_from": "multiplied demonstrations",
         "dagger_rounds": "rounds of DAgger",
+        "demonstrator": "demonstrator",
+        "noise": "noise of the demonstrations",
+        "budget": "budget",
         "world": "world",
         "learned_in": "world of the demonstrations",
+        "rules": "rules",
         "name": "condition",
         "place": "place",
     }
@@ -48,6 +52,12 @@ FACTORS: Mapping[str, str] = MappingProxyType(
 """Attribute of a condition → the name of a difference in it."""
 AMOUNTS = ("demonstrations", "looks", "multiplied_from", "dagger_rounds")
 """Fields that say how much there was to learn from."""
+DEMONSTRATED = ("demonstrations", "demonstrator", "noise")
+"""Fields that say what was demonstrated, by whom and how."""
+OF_RECIPES = ("encoder", "views", "pool", "changes", "budget", *DEMONSTRATED)
+OF_KINDS = ("recipe", "changes")
+OF_CONDITIONS = ("hierarchical", "world", "rules")
+"""What belongs to a recipe, to a kind of policy, and to a condition of a plan."""
 
 
 @dataclass(frozen=True)
@@ -92,28 +102,30 @@ def factor(first: Condition, second: Condition) -> str:
     """Name the one thing two conditions differ in, or ""."""
     if "state" in (first.encoder, second.encoder):
         return ""
-    blind = not first.views or not second.views
-    fields = [
-        name for name in FACTORS if not (blind and name == "pool")
-    ]  # without an encoder, nothing is pooled
-    differ = [name for name in fields if getattr(first, name) != getattr(second, name)]
+    differ = {name for name in FACTORS if getattr(first, name) != getattr(second, name)}
+    are_blind = [not first.views, not second.views]
     same_kind = "trained_by" not in differ
-    if "recipe" in differ and same_kind and bool(first.views) == bool(second.views):
-        whole = ("encoder", "views", "pool", "recipe", "changes", "demonstrations")
-        differ = [name for name in differ if name == "recipe" or name not in whole]
-    if {"trained_by", "recipe"} <= set(differ) and _same_budget(first, second):
-        differ = [name for name in differ if name not in ("recipe", "changes")]
-    if "multiplied_from" in differ and _originals(first) == _originals(second):
-        differ = [name for name in differ if name != "demonstrations"]
-    if "dagger_rounds" in differ:  # a round adds demonstrations
-        differ = [name for name in differ if name != "demonstrations"]
-    if set(differ) & set(AMOUNTS) and _without_amounts(first) == _without_amounts(second):
-        differ = [name for name in differ if name != "changes"]
-    if "name" in differ:  # it says which world
-        differ = [name for name in differ if name not in ("hierarchical", "world")]
-    if blind:
-        differ = ["images" if name == "encoder" else name for name in differ if name != "views"]
-    return FACTORS.get(differ[0], differ[0]) if len(differ) == 1 else ""
+    # Each: whether it holds, and the differences that then belong to another one.
+    belongs: tuple[tuple[bool, tuple[str, ...]], ...] = (
+        ("recipe" in differ and same_kind and len(set(are_blind)) == 1, OF_RECIPES),
+        ({"trained_by", "recipe"} <= differ and _same_budget(first, second), OF_KINDS),
+        (not same_kind, ("budget",)),
+        ("multiplied_from" in differ and _originals(first) == _originals(second), DEMONSTRATED),
+        ("dagger_rounds" in differ, DEMONSTRATED),
+        (not differ.isdisjoint(AMOUNTS) and _alike_otherwise(first, second), ("changes",)),
+        ("name" in differ, OF_CONDITIONS),
+        (any(are_blind), ("pool", "views")),  # without an encoder, nothing is pooled
+    )
+    differ -= {name for holds, names in belongs if holds for name in names}
+    if len(differ) != 1:
+        return ""
+    (name,) = differ
+    return "images" if name == "encoder" and any(are_blind) else FACTORS[name]
+
+
+def _alike_otherwise(first: Condition, second: Condition) -> bool:
+    """Return True if the recipes are changed alike, frames and epochs aside."""
+    return _without_amounts(first) == _without_amounts(second)
 
 
 def _without_amounts(condition: Condition) -> list[str]:

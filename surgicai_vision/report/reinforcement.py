@@ -1,19 +1,21 @@
 """Reinforcement and offline learning: tables 1 and 4 next to the paper's, and learning curves.
 
 `learned(groups)` is None if no evaluation is of an actor (`train --algo`). It has one row per
-algorithm, settings and number of demonstrations. Its cells are pooled counts of all training seeds
-with their exact interval, next to the paper's number if its table has one that is known here. The
+algorithm, settings, number of demonstrations, world and bank of starts. Its cells are pooled counts
+of all training seeds with their exact interval, next to the paper's number if its table has one
+that is known here, and starts, world and rules are as in the paper. The
 interquartile mean and the probability of improvement (`aggregates`) are taken over runs, one per
 task and training seed. Learning curves are those of the `curve.json` next to a policy: on
 validation starts, not on the held-out ones of the tables.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from surgicai_vision.core import files, names, percentages
 from surgicai_vision.core.errors import BadFile
@@ -21,7 +23,8 @@ from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import aggregates, charts, paper, text
 from surgicai_vision.report.charts import Point, Series
 from surgicai_vision.report.curves import MOST, Chart
-from surgicai_vision.report.groups import Group
+from surgicai_vision.report.experiment_key import Condition, distinctions
+from surgicai_vision.report.groups import Group, starts_of
 from surgicai_vision.report.reader import Result
 from surgicai_vision.rl.algorithms import ALGORITHMS
 
@@ -38,7 +41,8 @@ class Row:
 
     Attributes:
         algo: its name.
-        settings: what is changed, what it sees and its demonstrations, in words.
+        settings: what is changed, what it sees, its demonstrations and what is unusual about its
+            world and starts, in words.
         shared: those of them that all rows of the table share.
         groups: task → its evaluations.
     """
@@ -52,6 +56,11 @@ class Row:
     def label(self) -> str:
         """The algorithm with what distinguishes it from the other rows."""
         return ", ".join((self.algo, *(word for word in self.settings if word not in self.shared)))
+
+    @property
+    def is_as_published(self) -> bool:
+        """Whether the paper's numbers are of the same starts, world and rules."""
+        return all(item.condition.is_as_published for item in self.groups.values())
 
     def scores(self, tasks: Sequence[str]) -> list[list[float]]:
         """Return the success rate of each training seed on each task."""
@@ -78,6 +87,7 @@ class Learned:
     """What a page says about learning.
 
     Attributes:
+        starts: what the starts of its counts are, in words.
         tasks: columns of the table.
         head: headings of the columns.
         rows: its rows, as text.
@@ -87,6 +97,7 @@ class Learned:
         curves: success during training against control steps, and against minutes, per task.
     """
 
+    starts: str
     tasks: tuple[str, ...]
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -104,6 +115,7 @@ def learned(groups: Sequence[Group]) -> Learned | None:
     tasks = tuple(task for task in names.SUBTASKS if any(task in row.groups for row in rows))
     best = max(rows, key=lambda row: (len(row.groups), row.aggregate[0]))
     return Learned(
+        starts_of([item for row in rows for item in row.groups.values()]),
         tasks,
         ("algorithm", *tasks, "interquartile mean"),
         tuple(_cells(row, tasks) for row in rows),
@@ -116,36 +128,41 @@ def learned(groups: Sequence[Group]) -> Learned | None:
 
 def table(groups: Sequence[Group]) -> list[Row]:
     """Return the algorithms that have results, in the order of SurgicAI's tables."""
-    found: dict[tuple[str, tuple[str, ...]], dict[str, Group]] = {}
+    found: dict[Condition, dict[str, Group]] = {}
     for item in groups:
         condition = item.condition
         # Cloning from images is also called "bc"; an actor's run names its algorithm.
         is_actor = any(result.run.algo for result in item.results) and condition.plain
         is_actor = is_actor and condition.trained_by in ALGORITHMS
         if item.episodes and is_actor and condition.task in names.SUBTASKS and not condition.place:
-            by_task = found.setdefault((condition.trained_by, _settings(item)), {})
-            by_task[condition.task] = item
+            found.setdefault(replace(condition, task=""), {})[condition.task] = item
+    settings = _settings(found)
     order = list(ALGORITHMS)
-    keys = sorted(found, key=lambda key: (order.index(key[0]), key[1]))
-    every = [settings for _, settings in keys]
+    keys = sorted(found, key=lambda key: (order.index(key.trained_by), settings[key]))
+    every = [settings[key] for key in keys]
     shared = tuple(word for word in every[0] if all(word in each for each in every)) if keys else ()
-    return [Row(algo, settings, shared, found[algo, settings]) for algo, settings in keys]
+    return [Row(key.trained_by, settings[key], shared, found[key]) for key in keys]
 
 
-def _settings(item: Group) -> tuple[str, ...]:
-    """Return what is changed, what it sees and its demonstrations, in words."""
-    condition = item.condition
-    words = list(condition.changes)
-    words += [condition.encoder] if condition.encoder != "relative" else []
-    words += [f"{condition.demonstrations} demonstrations"] if condition.demonstrations else []
-    return tuple(words)
+def _settings(conditions: Collection[Condition]) -> dict[Condition, tuple[str, ...]]:
+    """Return the settings of each condition, in words; see `Row`."""
+    without_count = {key: replace(key, demonstrations=None) for key in conditions}
+    details = distinctions(without_count.values())
+    found = {}
+    for key in conditions:
+        words = list(key.changes)
+        words += [key.encoder] if key.encoder != "relative" else []
+        words += [f"{key.demonstrations} demonstrations"] if key.demonstrations else []
+        words += [*key.surroundings, details[without_count[key]]]
+        found[key] = tuple(filter(None, words))
+    return found
 
 
 def _cells(row: Row, tasks: Sequence[str]) -> tuple[str, ...]:
     """Return a row of the table as text."""
     cells = []
     for task in tasks:
-        theirs = paper.LEARNED.get(row.algo, {}).get(task)
+        theirs = paper.LEARNED.get(row.algo, {}).get(task) if row.is_as_published else None
         beside = f"; paper {percentages.percent(theirs)}" if theirs is not None else ""
         item = row.groups.get(task)
         if item is None:
@@ -265,6 +282,8 @@ def _chart(
     """Draw learning curves; the table has where each seed first reaches `MARK`."""
     drawn = lines[:MOST]
     more = len([line for line in lines[MOST:] if line.points])
+    has_points = any(line.points for line in drawn)
+    label = f"{title}: success [%] on validation starts"
     rows = []
     for line in (line for line in lines if line.points):
         firsts = [first_at(MARK, curve) for curve in by_label[line.name]]
@@ -272,7 +291,7 @@ def _chart(
         rows.append((line.name, line.points[-1].text, reached))
     return Chart(
         title,
-        charts.curves(drawn, x_name, label=f"{title}: success [%] on validation starts"),
+        charts.curves(drawn, x_name, label=label) if has_points else Markup(""),
         charts.key(drawn),
         ("algorithm", "last evaluation of each seed", f"first at {percentages.percent(MARK)}"),
         tuple(rows),
@@ -286,7 +305,7 @@ def _chart(
 def markdown(found: Learned) -> str:
     """Return the tables as Markdown, for a page of results."""
     parts = [
-        f"Success from held-out starts: k/n over all training seeds (exact 95 % interval); paper: "
+        f"Success from {found.starts}: k/n over all training seeds (exact 95 % interval); paper: "
         f"{paper.LEARNED_SOURCE}. Interquartile mean over runs with its bootstrap interval.",
         *([f"Every row: {', '.join(found.shared)}."] if found.shared else []),
         "",

@@ -20,7 +20,7 @@ from surgicai_vision.evaluation.robustness import ALL
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Bar
 from surgicai_vision.report.curves import Chart, base_of, evaluated, with_zero
-from surgicai_vision.report.experiment_key import Condition
+from surgicai_vision.report.experiment_key import Condition, labels
 from surgicai_vision.report.groups import Group
 from surgicai_vision.report.reader import Result
 
@@ -55,16 +55,19 @@ def retentions(groups: Sequence[Group]) -> list[Chart]:
     for task in task_names():
         mine = [item for item in groups if evaluated(item, task) and not item.condition.expert_swap]
         axes = list(dict.fromkeys(item.condition.axis for item in mine if item.condition.axis))
-        kept: dict[str, list[Kept]] = {}
+        kept: dict[Condition, list[Kept]] = {}
         for axis in axes:
-            along: dict[str, list[Group]] = {}
+            along: dict[Condition, list[Group]] = {}
             for item in with_zero(mine, axis):
-                along.setdefault(base_of(item).label, []).append(item)
-            for label, items in along.items():
+                along.setdefault(base_of(item), []).append(item)
+            for base, items in along.items():
                 one = _kept(axis, items)
                 if one is not None:
-                    kept.setdefault(label, []).append(one)
-        found += [_chart(task, label, rows) for label, rows in kept.items() if len(rows) > 1]
+                    kept.setdefault(base, []).append(one)
+        label_of = labels(kept)
+        found += [
+            _chart(task, label_of[base], rows) for base, rows in kept.items() if len(rows) > 1
+        ]
     return found
 
 
@@ -183,12 +186,13 @@ def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
                 world = replace(axes, appearance="", appearance_shift=0.0)
                 by_look = seen.setdefault((known, item.condition.learned_in, world), {})
                 by_look.setdefault(axes.shows_heldout, []).append(result)
+    label_of = labels({known for known, _, _ in seen})
     rows: list[tuple[str, ...]] = []
     for (known, _, _), by_look in seen.items():
         if len(by_look) == 2:
             held_in, held_out = _wins(by_look[False]), _wins(by_look[True])
             counts = _count(held_in), _count(held_out), _ratio(held_in, held_out)
-            rows.append((known.task, known.label, *counts))
+            rows.append((known.task, label_of[known], *counts))
     return rows
 
 

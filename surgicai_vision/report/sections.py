@@ -74,7 +74,9 @@ def ceilings(groups: Sequence[Group]) -> str:
         mine = [
             item
             for item in of_task(groups, task)
-            if item.condition.encoder == "state" and item.episodes
+            if item.condition.encoder == "state"
+            and item.condition.is_as_published
+            and item.episodes
         ]
         if of_task(groups, task):
             ours = f", ours {our_text(mine[-1])}" if mine else ""
@@ -162,7 +164,7 @@ def success_row(at: int, item: Group, best: Group | None) -> dict[str, object]:
         "policy": condition.policy if condition.plain else condition.label,
         "encoder": condition.encoder,
         "views": condition.view or text.ABSENT,
-        "demonstrations": item.demonstrations,
+        "details": item.details,
         "plain": condition.plain,
         "kind": "" if condition.trained else "reference",
         "note": _note(item),

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core import files
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.evaluation.storage import parquet_bytes
@@ -24,6 +26,8 @@ from surgicai_vision.report.paper_comparison import paper_rate
 from surgicai_vision.report.reader import REFERENCES, Result
 from surgicai_vision.report.reinforcement import learned
 from surgicai_vision.report.reinforcement import markdown as learned_markdown
+from surgicai_vision.training.checkpoint import read_checkpoint
+from surgicai_vision.training.released import resolve
 
 FOLDER = "tables"
 
@@ -90,7 +94,7 @@ def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, object]]:
     """
     for item in groups:
         for result in item.results:
-            k = result.summary["successes"]
+            k = sum(bool(row["success"]) for row in result.rows)
             n = len(result.rows)
             low, high = statistics.clopper_pearson(k, n)
             checkpoint = result.checkpoint
@@ -125,12 +129,17 @@ def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, object]]:
 
 
 def evaluate_command(result: Result) -> str | None:
-    """Return the command that evaluates a cell's stored policy again, if one line can."""
+    """Return the command that evaluates a cell's stored policy again, if one line can.
+
+    An option alone sets neither the env nor how a policy acts, so both must be the policy's own.
+    """
     about = result.about
     seeds = [row["seed"] for row in result.rows]
     whole = seeds == list(range(seeds[0], seeds[0] + len(seeds)))
     condition = result.condition
     if not whole or not condition.plain or condition.name or result.run.is_hierarchical:
+        return None
+    if result.run.acted_by or result.config != _own_env(result):
         return None
     ending = f"--task {result.summary['task']} --episodes {len(seeds)} --seed {seeds[0]} --json"
     name = result.summary["policy"]
@@ -139,6 +148,20 @@ def evaluate_command(result: Result) -> str | None:
 
         return f"surgicai-vision evaluate {shlex.quote(str(about['folder']))} {ending}"
     return f"surgicai-vision evaluate {name} {ending}" if name in REFERENCES[:3] else None
+
+
+def _own_env(result: Result) -> TaskConfig:
+    """Return the env in which `evaluate` runs a result's policy unless it is given another.
+
+    It is the task's for a reference, and that of the training for a policy. The training's step
+    limit and rules are known only where its checkpoint still is.
+    """
+    if not result.trained:
+        return TaskConfig(result.run.task)
+    try:
+        return read_checkpoint(resolve(str(result.about.get("folder", "")))).task
+    except SurgicaiError:
+        return result.run.recorded_in or result.config
 
 
 def _filled(rows: list[dict[str, object]]) -> list[dict[str, object]]:
@@ -154,6 +177,9 @@ def _identity(condition: Condition) -> dict[str, object]:
         "views": "+".join(condition.views),
         "variant": condition.variant,
         "demonstrations": condition.demonstrations,
+        "demonstrator": condition.demonstrator or None,
+        "noise": condition.noise,
+        "budget": condition.budget or None,
         "shift": condition.axis,
         "strength": condition.strength,
         "expert_in": condition.expert_swap,

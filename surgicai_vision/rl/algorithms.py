@@ -25,7 +25,8 @@ DETERMINISTIC = (*OFF_POLICY, "exploration_noise")
 TWIN_DELAYED = (*DETERMINISTIC, "policy_delay", "target_noise", "target_noise_clip")
 HINDSIGHT = ("goals", "relabel_demand")
 CLONING = ("demo_share", "bc_weight", "q_filter", "normalise_q", "clip_q")
-OFFLINE = (*COMMON, "tau", "critics", "samples")
+OFFLINE_CRITICS = (*COMMON, "tau", "critics")
+OFFLINE_SAMPLES = (*OFFLINE_CRITICS, "samples")
 CLONED: Mapping[str, JSON] = {"tau": 0.01, "learning_rate": 3e-4}
 """Defaults with a cloning loss: at 1e-3 the policy unlearns again (docs/results/rl.md)."""
 PAPERS_RATE = 3e-4
@@ -71,10 +72,12 @@ class Algorithm:
         return "bc_weight" in self.settings
 
 
-def _offline(kind: str, paper: str, policy: str = "actor", **defaults: JSON) -> Algorithm:
+def _offline(
+    kind: str, paper: str, settings: tuple[str, ...], policy: str = "actor", **defaults: JSON
+) -> Algorithm:
     """Return an algorithm of d3rlpy, with settings that differ from those of `Settings`."""
     return Algorithm(
-        D3RLPY, kind, paper, OFFLINE, defaults, needs_demos=True, is_online=False, policy=policy
+        D3RLPY, kind, paper, settings, defaults, needs_demos=True, is_online=False, policy=policy
     )
 
 
@@ -150,29 +153,33 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType(
             needs_demos=True,
             has_layer_norm=True,
         ),
-        "bc": _offline("BC", "Pomerleau, ALVINN, NeurIPS 1988"),
+        "bc": _offline("BC", "Pomerleau, ALVINN, NeurIPS 1988", COMMON),
         "awac": _offline(
             "AWAC",
             "Nair et al., AWAC: accelerating online reinforcement learning with offline datasets, "
             "arXiv:2006.09359",
+            OFFLINE_CRITICS,
             learning_rate=PAPERS_RATE,
         ),
         "bcq": _offline(
             "BCQ",
             "Fujimoto et al., Off-policy deep reinforcement learning without exploration, "
             "ICML 2019, arXiv:1812.02900",
-            "bcq",
+            OFFLINE_SAMPLES,
+            policy="bcq",
         ),
         "iql": _offline(
             "IQL",
             "Kostrikov et al., Offline reinforcement learning with implicit Q-learning, ICLR 2022, "
             "arXiv:2110.06169",
+            OFFLINE_CRITICS,
             learning_rate=PAPERS_RATE,
         ),
         "cal-ql": _offline(
             "CalQL",
             "Nakamoto et al., Cal-QL: calibrated offline RL pre-training for efficient online "
             "fine-tuning, NeurIPS 2023, arXiv:2303.05479",
+            OFFLINE_SAMPLES,
             learning_rate=PAPERS_RATE,
         ),
     }

@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.rl.export import ACTIONS, fill, space_of
+from surgicai_vision.rl.settings import demonstration_rows
 from surgicai_vision.rl.transitions import Transitions
 
 DEMAND = 7
@@ -48,7 +49,7 @@ class Demonstrations:
 
     def rows(self, batch_size: int) -> int:
         """Return how many rows of a batch, the last ones, are demonstrations."""
-        return round(self._share * batch_size)
+        return demonstration_rows(self._share, batch_size)
 
     def mixed(self, own: Samples, batch_size: int) -> Samples:
         """Return `own` followed by the demonstrations of a batch of `batch_size`."""

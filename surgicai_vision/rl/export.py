@@ -27,6 +27,7 @@ import copy
 import io
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -49,9 +50,8 @@ from surgicai_vision.rl.transitions import OBSERVATION, Transitions, write_trans
 if TYPE_CHECKING:
     from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 
-NPZ = "transitions.npz"
 CARD = "transitions.json"
-"""File that describes what the folder holds."""
+"""File that describes what the folder holds; written last."""
 ROBOMIMIC_GYM = 2
 """`EnvType.GYM_TYPE` of robomimic 0.3 (robomimic/envs/env_base.py)."""
 ROBOMIMIC_FLAT = "flat"
@@ -64,6 +64,8 @@ ACTIONS = spaces.Box(-1.0, 1.0, (7,), np.float32)
 def write(transitions: Transitions, format: str, out: Path) -> Path:
     """Write transitions into a folder; return the file or folder that a library reads.
 
+    An earlier export in the same format is replaced.
+
     Args:
         transitions: transitions of one env.
         format: one of `FORMATS`.
@@ -75,7 +77,8 @@ def write(transitions: Transitions, format: str, out: Path) -> Path:
     check_name("format", format, FORMATS)
     check_extra(f"--format {format}", *PACKAGES[format])
     out.mkdir(parents=True, exist_ok=True)
-    written = FORMATS[format](transitions, out)
+    written = out / FILES[format]
+    FORMATS[format](transitions, written)
     write_json(
         out / CARD,
         {
@@ -91,23 +94,19 @@ def write(transitions: Transitions, format: str, out: Path) -> Path:
     return written
 
 
-def _write_npz(transitions: Transitions, out: Path) -> Path:
-    path = out / NPZ
+def _write_npz(transitions: Transitions, path: Path) -> None:
     write_transitions(path, transitions)
-    return path
 
 
-def _write_sb3(transitions: Transitions, out: Path) -> Path:
+def _write_sb3(transitions: Transitions, path: Path) -> None:
     from stable_baselines3.common.save_util import save_to_pkl
 
     content = io.BytesIO()
     save_to_pkl(content, buffer_of(transitions))
-    path = out / "buffer.pkl"
     write_bytes(path, content.getvalue())
-    return path
 
 
-def _write_d3rlpy(transitions: Transitions, out: Path) -> Path:
+def _write_d3rlpy(transitions: Transitions, path: Path) -> None:
     from d3rlpy.dataset import MDPDataset
 
     dataset = MDPDataset(
@@ -119,18 +118,18 @@ def _write_d3rlpy(transitions: Transitions, out: Path) -> Path:
     )
     content = io.BytesIO()
     dataset.dump(content)
-    path = out / "dataset.h5"
     write_bytes(path, content.getvalue())
-    return path
 
 
-def _write_minari(transitions: Transitions, out: Path) -> Path:
-    folder = out / "minari"
+def _write_minari(transitions: Transitions, folder: Path) -> None:
     os.environ["MINARI_DATASETS_PATH"] = str(folder.absolute())
     import minari
     from minari.data_collector import EpisodeBuffer
 
     config = transitions.config
+    dataset_id = f"surgicai/{config.task}/{transitions.obs_type}-v0"
+    if (folder / dataset_id).exists():
+        shutil.rmtree(folder / dataset_id)  # Minari does not replace a dataset
     episodes = [
         EpisodeBuffer(
             id=index,
@@ -144,7 +143,7 @@ def _write_minari(transitions: Transitions, out: Path) -> Path:
         for index, rows in enumerate(_rows(transitions))
     ]
     minari.create_dataset_from_buffers(
-        f"surgicai/{config.task}/{transitions.obs_type}-v0",
+        dataset_id,
         episodes,
         env=spec_of(transitions),
         action_space=ACTIONS,
@@ -153,10 +152,9 @@ def _write_minari(transitions: Transitions, out: Path) -> Path:
         description=f"{env_id(config.task)}, obs_type {transitions.obs_type}, "
         f"reward {config.reward}; {json.dumps({'demos': transitions.demos})}",
     )
-    return folder
 
 
-def _write_robomimic(transitions: Transitions, out: Path) -> Path:
+def _write_robomimic(transitions: Transitions, path: Path) -> None:
     import h5py
 
     content = io.BytesIO()
@@ -189,12 +187,10 @@ def _write_robomimic(transitions: Transitions, out: Path) -> Path:
         for mask, demos in masks.items():
             if demos:
                 file[f"mask/{mask}"] = np.array(demos)
-    path = out / "demo.hdf5"
     write_bytes(path, content.getvalue())
-    return path
 
 
-FORMATS: Mapping[str, Callable[[Transitions, Path], Path]] = MappingProxyType(
+FORMATS: Mapping[str, Callable[[Transitions, Path], None]] = MappingProxyType(
     {
         "npz": _write_npz,
         "sb3": _write_sb3,
@@ -203,7 +199,17 @@ FORMATS: Mapping[str, Callable[[Transitions, Path], Path]] = MappingProxyType(
         "robomimic": _write_robomimic,
     }
 )
-"""Format → function that writes it."""
+"""Format → function that writes it to a path."""
+FILES: Mapping[str, str] = MappingProxyType(
+    {
+        "npz": "transitions.npz",
+        "sb3": "buffer.pkl",
+        "d3rlpy": "dataset.h5",
+        "minari": "minari",
+        "robomimic": "demo.hdf5",
+    }
+)
+"""Format → name of its file or folder, which a killed export may leave without the card."""
 PACKAGES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "npz": (),

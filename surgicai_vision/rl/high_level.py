@@ -31,19 +31,23 @@ from stable_baselines3 import PPO
 from torch import nn
 
 from policies.base import Policy, Recipe
-from surgicai_vision import __version__
+from surgicai_vision import __version__, envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import PhysicsError
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.envs.suture import Suture
-from surgicai_vision.evaluation.agent import Agent
+from surgicai_vision.evaluation.agent import Agent, MakeAgent
 from surgicai_vision.evaluation.agents import PolicyAgent
-from surgicai_vision.evaluation.hierarchical import GRASP, HierarchicalAgent
+from surgicai_vision.evaluation.hierarchical import (
+    HierarchicalAgent,
+    common_images,
+    leave_held_grasp,
+)
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.rollout import run_share
-from surgicai_vision.evaluation.slot import env_of
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.rl.extractor import StandardExtractor
 from surgicai_vision.rl.high_level_config import HighLevelRequest
 from surgicai_vision.rl.learner import linear, random_state, set_random_state
@@ -94,12 +98,15 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
         config: limits on the steps of a subtask and the decisions of an episode.
         task: the whole procedure's config.
         low: the low-level policies' agents, in the order of the subtasks.
+
+    Raises:
+        InputError: agents that cannot act in one env (`common_images`).
     """
 
     def __init__(self, config: HierarchicalConfig, task: TaskConfig, low: Sequence[Agent]):
         self.config = config
         self._low = list(low)
-        self._env = cast(Suture, env_of(self._low[0], task))
+        self._env = _env_for(self._low, task)
         self._observation: Any = None
         self._decisions = 0
         self.control_steps = 0
@@ -141,7 +148,10 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
                 truncated = True
                 break
             self.control_steps += 1
-            if terminated or truncated or self._has_ended(subtask):
+            if terminated or truncated:
+                break
+            leave_held_grasp(env, subtask, self.config.grasp_hold)
+            if env.phase != subtask:
                 break
         success = bool(info.get("is_success", False))
         solved = success or env.simulation.task_state.done > due
@@ -149,13 +159,6 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
         truncated = truncated or self._decisions >= self.config.decisions
         about = {"is_success": success, "progress": env.simulation.task_state.done}
         return env.both_arms(), float(solved), terminated, truncated, about
-
-    def _has_ended(self, subtask: int) -> bool:
-        """Return True if the present subtask's success has held, as in privileged termination."""
-        env = self._env
-        if subtask == env.phase == GRASP and env.dwell >= self.config.grasp_hold:
-            env.enter(GRASP + 1)
-        return env.phase != subtask
 
     @property
     def phase(self) -> int:
@@ -167,23 +170,39 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
         self._env.close()
 
 
+def _env_for(agents: Sequence[Agent], task: TaskConfig) -> Suture:
+    """Make the env of the whole procedure, with the images that any of the agents sees."""
+    cameras, image_size = common_images(agents)
+    obs_type = "pixels_agent_pos" if cameras else "state"
+    env = cast(Suture, envs.make(task, obs_type, cameras, image_size))
+    if cameras:
+        env.defer_images()
+    return env
+
+
 def train_high_level(
-    request: HighLevelRequest, out: Path, *, progress: Progress | None = None
+    request: HighLevelRequest,
+    out: Path,
+    *,
+    weights: WeightsSource = ANYWHERE,
+    progress: Progress | None = None,
 ) -> Checkpoint:
     """Train PPO over low-level policies, or resume an interrupted training.
 
     Args:
         request: what is trained.
         out: the checkpoint folder; new, or one of the same request.
+        weights: where pretrained weights come from.
         progress: called with (decisions done, decisions in total).
 
     Raises:
         BadFile: a low-level policy that is not a checkpoint.
-        InputError: policies of other subtasks, or of different scenes.
+        InputError: policies of other subtasks, of different scenes or of images of several sizes.
+        MissingWeights: an encoder's weights are not at hand.
         OutputExists: `out` holds something else.
     """
-    spec = hierarchical_policy(request.low)
-    low = [open_policy(path, task=task) for task, path in request.low.low.items()]
+    spec = hierarchical_policy(request.low, weights=weights)
+    low = [open_policy(path, task=task, weights=weights) for task, path in request.low.low.items()]
     acting = [one.about.get("checkpoint") or one.name for one in low]
     wanted = {"code_version": __version__, "request": to_mapping(request), "low": acting}
     if done := begin(out, wanted):
@@ -191,7 +210,8 @@ def train_high_level(
     with torch.random.fork_rng(devices=[]), one_thread():
         env = DecisionEnv(request.low, spec.config, [one.make_agent() for one in low])
         try:
-            checkpoint = _run(request, spec.config, env, out, progress or silent)
+            make_low = [one.make_agent for one in low]
+            checkpoint = _run(request, spec.config, make_low, env, out, progress or silent)
         finally:
             env.close()
     remove_state(out)
@@ -199,7 +219,12 @@ def train_high_level(
 
 
 def _run(
-    request: HighLevelRequest, task: TaskConfig, env: DecisionEnv, out: Path, progress: Progress
+    request: HighLevelRequest,
+    task: TaskConfig,
+    low: Sequence[MakeAgent],
+    env: DecisionEnv,
+    out: Path,
+    progress: Progress,
 ) -> Checkpoint:
     """Learn to the end, with periodic evaluations and training states."""
     mean, std = _statistics(env)
@@ -208,7 +233,7 @@ def _run(
 
     def evaluate(minutes: float) -> tuple[Point, Weights]:
         policy = _policy(request, model)
-        point = _evaluate(request, task, policy, model.num_timesteps, env, minutes)
+        point = _evaluate(request, task, low, policy, model.num_timesteps, env, minutes)
         return point, policy.state_dict()
 
     stages = Stages(request.decisions, request.save_every, request.seed, out, progress)
@@ -319,6 +344,7 @@ def _policy(request: HighLevelRequest, model: PPO) -> Policy:
 def _evaluate(
     request: HighLevelRequest,
     task: TaskConfig,
+    low: Sequence[MakeAgent],
     policy: Policy,
     decisions: int,
     env: DecisionEnv,
@@ -329,9 +355,6 @@ def _evaluate(
     stages = 0.0
     if request.validation:
         high = functools.partial(PolicyAgent, HLP, policy, None, (), IMAGE_SIZE, (names.BOTH_ARMS,))
-        low = [
-            open_policy(path, task=subtask).make_agent for subtask, path in request.low.low.items()
-        ]
         make = functools.partial(HierarchicalAgent, request.low, low, high)
         seeds = range(names.VALIDATION_SEED, names.VALIDATION_SEED + request.validation)
         episodes = run_share(make, task, seeds, EVALUATED_AT_ONCE, report=lambda _: None)

@@ -163,15 +163,13 @@ class OnlineLearner(Learner):
         return options
 
     def _learning_starts(self) -> int:
-        """Return the number of random steps at first: hindsight needs a finished episode."""
-        settings = self.request.settings
-        if settings.learning_starts:
-            return settings.learning_starts
-        env = self.request.env
-        episode = (env.max_steps // env.action_repeat + 1) * settings.envs
-        if self.request.algorithm.needs_demos:
-            return episode
-        return max(episode, FIRST_RANDOM_STEPS)
+        """Return the number of random steps at first."""
+        request = self.request
+        if request.settings.learning_starts:
+            return request.settings.learning_starts
+        if request.algorithm.needs_demos:
+            return request.episode
+        return max(request.episode, FIRST_RANDOM_STEPS)
 
     @property
     def _buffer(self) -> MixedBuffer | HindsightBuffer | None:

@@ -39,6 +39,7 @@ from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.rollout import run_share
 from surgicai_vision.evaluation.slot import env_of
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.rl.extractor import StandardExtractor
 from surgicai_vision.rl.learner import Arrays, State, linear, random_state, set_random_state
 from surgicai_vision.rl.nair import AnchoredTD3
@@ -47,7 +48,8 @@ from surgicai_vision.rl.rlpd import LayerNormTD3Policy
 from surgicai_vision.rl.settings import read_by
 from surgicai_vision.rl.stages import Stages
 from surgicai_vision.rl.train import Point, Weights
-from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
+from surgicai_vision.training import released
+from surgicai_vision.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
@@ -144,21 +146,28 @@ class CorrectionTD3(AnchoredTD3):
 
 
 def train_residual(
-    request: ResidualRequest, out: Path, *, progress: Progress | None = None
+    request: ResidualRequest,
+    out: Path,
+    *,
+    weights: WeightsSource = ANYWHERE,
+    progress: Progress | None = None,
 ) -> Checkpoint:
     """Train a correction, or resume an interrupted training.
 
     Args:
         request: what is trained.
         out: the checkpoint folder; new, or one of the same request.
+        weights: where pretrained weights come from.
         progress: called with (control steps done, control steps in total).
 
     Raises:
         BadFile: a base that is not a checkpoint.
-        InputError: a base that is not a behaviour-cloning policy of one subtask.
+        InputError: a base that is not a behaviour-cloning policy of one subtask, or that uses
+            another policy's progress.
+        MissingWeights: the weights of its encoder are not at hand.
         OutputExists: `out` holds something else.
     """
-    spec = base_of(request)
+    spec = base_of(request, weights)
     wanted = {
         "code_version": __version__,
         "request": to_mapping(request),
@@ -176,15 +185,15 @@ def train_residual(
     return checkpoint
 
 
-def base_of(request: ResidualRequest) -> PolicySpec:
+def base_of(request: ResidualRequest, weights: WeightsSource = ANYWHERE) -> PolicySpec:
     """Return the policy to correct; see `train_residual` for the errors."""
-    spec = open_policy(request.base)
+    spec = open_policy(request.base, weights=weights)
     if spec.run.policy != "bc" or spec.run.task not in names.SUBTASKS:
         raise InputError(
             f"{request.base} is '{spec.run.policy}' of '{spec.run.task}'; only a "
             "behaviour-cloning (bc) policy of one subtask can be corrected."
         )
-    if spec.run.recipe_changes.get("progress_input"):
+    if read_checkpoint(released.resolve(request.base)).progress_sha256:
         raise InputError(
             f"{request.base} uses another policy's progress; give a policy with a clock."
         )

@@ -34,7 +34,8 @@ class Settings:
         train_every: steps of an env between updates.
         updates: updates each time, for each env.
         learning_starts: env steps with random actions before the first update; 0 takes 1,000, or
-            one episode if that is longer; with demonstrations one episode.
+            one episode if that is longer; with demonstrations one episode. Hindsight needs at
+            least one episode (`Request.episode`).
         critics: number of critics; the smallest of their values is used.
         exploration_noise: standard deviation of the noise on actions (code .05).
         actor_starts: critic updates before the actor's first update, for a correction.
@@ -45,7 +46,8 @@ class Settings:
         relabel_demand: what a relabelled goal requires besides the pose: "achieved", what held at
             that time, as in the paper; "kept", what the task requires; "auto" keeps it if the task
             requires holes or the needle being out, which "go there" would otherwise replace.
-        demo_share: share of a batch that is drawn from the demonstrations (code .3).
+        demo_share: share of a batch that is drawn from the demonstrations (code .3), rounded to
+            whole transitions; at least one is a demonstration, and at least one is not.
         bc_weight: λ2, weight of the cloning loss; λ1 = 1 - λ2 is that of the critic's value (paper
             .2, .5, .8; .5 by default). For a correction's actor, the frozen policy is cloned.
         q_filter: clone only where the critic values the demonstrated action above the actor's.
@@ -182,6 +184,7 @@ class Request:
             )
         if algorithm.has_hindsight and self.env.reward != "sparse":
             raise InputError(f"'{self.algo}' needs the sparse reward, not '{self.env.reward}'.")
+        self._check_batches()
         if self.save_every < 1 or self.validation < 0 or self.seed < 0:
             raise InputError(
                 f"save_every is {self.save_every}, validation {self.validation}, seed "
@@ -190,6 +193,23 @@ class Request:
 
         if self.settings.stop_at and not self.validation:
             raise InputError("stop_at refers to validation starts; give validation of at least 1.")
+
+    def _check_batches(self) -> None:
+        """Refuse settings with which a batch cannot be drawn, or is not mixed as it should be."""
+        algorithm = self.algorithm
+        settings = self.settings
+        if algorithm.has_hindsight and 0 < settings.learning_starts < self.episode:
+            raise InputError(
+                f"learning_starts is {settings.learning_starts}; hindsight needs whole episodes "
+                f"before the first update. Give at least {self.episode}, or 0."
+            )
+        rows = demonstration_rows(settings.demo_share, settings.batch_size)
+        if "demo_share" in algorithm.settings and not 0 < rows < settings.batch_size:
+            raise InputError(
+                f"demo_share is {settings.demo_share}, so {rows} of the {settings.batch_size} "
+                "transitions of a batch would be demonstrations; at least one must be, and at "
+                "least one must not."
+            )
 
     @property
     def algorithm(self) -> Algorithm:
@@ -202,12 +222,22 @@ class Request:
         return self.env_steps if self.algorithm.is_online else self.updates
 
     @property
+    def episode(self) -> int:
+        """Env steps, over all envs, within which each env has finished an episode."""
+        return (self.env.max_steps // self.env.action_repeat + 1) * self.settings.envs
+
+    @property
     def keeps_demand(self) -> bool:
         """Whether a relabelled goal keeps the requirement of the task."""
         if self.settings.relabel_demand != "auto":
             return self.settings.relabel_demand == "kept"
         demands = load_subtask(self.env.task).demands[self.env.tolerance]
         return bool(demands.holes or demands.out)
+
+
+def demonstration_rows(demo_share: float, batch_size: int) -> int:
+    """Return how many transitions of a batch are demonstrations."""
+    return round(demo_share * batch_size)
 
 
 def settings_of(algo: str, changes: Mapping[str, JSON]) -> Settings:

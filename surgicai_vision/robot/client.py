@@ -141,15 +141,12 @@ class Client:
         while True:
             self.update()
             deaf = [topic.name for topic in self._said if not self._transport.listeners(topic)]
-            mute = [name for name in self._inboxes if self._is_due(name) and not self.newest(name)]
-            if not deaf and not mute and (not self._is_simulated or self._is_answered(stamp)):
+            missing = self._missing(deaf, stamp)
+            if not missing:
                 return
             if time.monotonic() > ends:
-                problems = [f"nobody subscribes to {', '.join(deaf)}"] if deaf else []
-                problems += [f"nothing arrives on {', '.join(mute)}"] if mute else []
-                problems += [] if problems else ["a request is not answered"]
                 raise SurgicaiError(
-                    f"No robot answers: {'; '.join(problems)}. Is it on, in the same domain and on "
+                    f"No robot answers: {'; '.join(missing)}. Is it on, in the same domain and on "
                     "the same interface?"
                 )
             if self._is_simulated and not deaf and time.monotonic() > asked + ASK_AGAIN_S:
@@ -259,6 +256,23 @@ class Client:
             f"The served simulation has not answered on {topics.STEPPED.name} for {STEP_S:g} s; "
             "is it served with --clock stepped, in the same domain and on the same interface?"
         )
+
+    def _missing(self, deaf: Sequence[str], stamp: int) -> list[str]:
+        """Return what is missing of a connection, one sentence each.
+
+        Args:
+            deaf: topics that nobody subscribes to.
+            stamp: stamp of the request that a served simulation has to answer [ns].
+        """
+        missing = []
+        if deaf:
+            missing.append(f"nobody subscribes to {', '.join(deaf)}")
+        mute = [name for name in self._inboxes if self._is_due(name) and not self.newest(name)]
+        if mute:
+            missing.append(f"nothing arrives on {', '.join(mute)}")
+        if not missing and self._is_simulated and not self._is_answered(stamp):
+            missing.append("a request is not answered")
+        return missing
 
     def _is_answered(self, stamp: int) -> bool:
         """Return True if a request was answered and all that was published with it has arrived."""

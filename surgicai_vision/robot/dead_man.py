@@ -1,6 +1,8 @@
 """Dead-man's switch: what a person must hold for anything to be sent.
 
-Each reports the time since it was last seen held; `robot.guards.DEAD_MAN_S` is the limit.
+Each reports the time since it was last certainly held; `robot.guards.DEAD_MAN_S` is the limit. What
+has been waiting to be read may have come at any time since the previous reading, so it counts from
+there: a press from before a pause does not count as one of now.
 """
 
 import math
@@ -39,6 +41,7 @@ class HeldKey:
             )
         self._descriptor = sys.stdin.fileno()
         self._seen = -math.inf
+        self._read = -math.inf
 
     def __enter__(self) -> Self:
         self._before = termios.tcgetattr(self._descriptor)
@@ -50,13 +53,15 @@ class HeldKey:
 
     def age(self) -> float:
         """Return the time since the key was last seen held [s]."""
+        now = time.monotonic()
         while select.select([self._descriptor], [], [], 0.0)[0]:
             text = os.read(self._descriptor, 64).decode("utf-8", "ignore")
             if not text:
                 break
             if KEY in text:
-                self._seen = time.monotonic()
-        return time.monotonic() - self._seen
+                self._seen = self._read
+        self._read = now
+        return now - self._seen
 
 
 @final
@@ -73,12 +78,15 @@ class HeldPedal:
     def __init__(self, transport: Transport, topic: str):
         self._inbox = transport.inbox(Topic(topic, Joy))
         self._seen = -math.inf
+        self._read = -math.inf
 
     def age(self) -> float:
         """Return the time since the button was last seen held [s]."""
+        now = time.monotonic()
         for received in self._inbox():
             message = received.message
             if isinstance(message, Joy):
                 is_held = message.buttons[:1] == (1,)
-                self._seen = time.monotonic() if is_held else -math.inf
-        return time.monotonic() - self._seen
+                self._seen = self._read if is_held else -math.inf
+        self._read = now
+        return now - self._seen

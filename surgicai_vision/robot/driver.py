@@ -14,8 +14,8 @@ go at the beginning of the pull-out.
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TextIO, final
 
 import numpy as np
@@ -97,6 +97,28 @@ class DrivenEpisode:
     image_latencies: tuple[float, ...]
 
 
+@dataclass(frozen=True)
+class _Step:
+    """What is decided in one control step.
+
+    Attributes:
+        problem: why nothing may be sent, or "".
+        seen: measured poses and jaws of both arms, as `DrivenRobot.both_arms`; empty before the
+            agent is asked.
+        action: the agent's action, (7,); None if it was not asked or its input cannot be used.
+        commands: arm → what the action commands.
+        latency: age of the newest pose after the decision [s]; None if the agent was not asked.
+        image_latency: age of the newest image, likewise; None also without images.
+    """
+
+    problem: str
+    seen: Sequence[float] = ()
+    action: NDArray[np.float32] | None = None
+    commands: Mapping[str, Command] = field(default_factory=dict)
+    latency: float | None = None
+    image_latency: float | None = None
+
+
 @final
 class Driver:
     """Lets an agent drive a robot; see the module's docstring.
@@ -169,28 +191,16 @@ class Driver:
             self._client.update()
             image_age = self._setpoints.youngest_image()
             begun = time.monotonic()
-            problem = self._setpoints.problem_of_inputs()
-            commands: Mapping[str, Command] = {}
-            action: NDArray[np.float32] | None = None
-            seen: list[float] = []
-            if not problem:
-                now = number * CONTROL_S if self._config.is_stepped else time.monotonic()
-                try:
-                    seen = robot.both_arms().tolist()
-                    action = self._agent.act([0], [robot], [robot.observation()])[0]
-                    commands, problem = self._setpoints.of_action(action, now)
-                except InputError as error:  # the input cannot be used
-                    problem = str(error)
-                latencies.append(self._setpoints.youngest())
-                seen_at = self._setpoints.youngest_image()
-                image_latencies += [] if seen_at is None else [seen_at]
-            self._setpoints.send(commands if not problem else {})
-            steps += not problem
-            held += bool(problem)
-            latency = latencies[-1] if action is not None else None
-            self._write(seed, number, seen, action, commands, problem, latency)
-            self._say(commands, problem)
-            stop = self._stop(action)
+            now = number * CONTROL_S if self._config.is_stepped else begun
+            step = self._decide(now)
+            self._setpoints.send({} if step.problem else step.commands, now)
+            steps += not step.problem
+            held += bool(step.problem)
+            latencies += [] if step.latency is None else [step.latency]
+            image_latencies += [] if step.image_latency is None else [step.image_latency]
+            self._write(seed, number, step)
+            self._say(step)
+            stop = self._stop(step.action)
             if stop:
                 ended = stop
                 break
@@ -223,17 +233,41 @@ class Driver:
 
     # -- what is done ------------------------------------------------------------------------------
 
+    def _decide(self, now: float) -> _Step:
+        """Let the agent act at `now` [s], and the guards judge; nothing is sent yet."""
+        problem = self._setpoints.problem_of_inputs()
+        if problem:
+            return _Step(problem)
+        robot = self._robot
+        seen: list[float] = []
+        action: NDArray[np.float32] | None = None
+        commands: Mapping[str, Command] = {}
+        try:
+            seen = robot.both_arms().tolist()
+            action = self._agent.act([0], [robot], [robot.observation()])[0]
+            commands, problem = self._setpoints.of_action(action, now)
+        except InputError as error:  # the input cannot be used
+            problem = str(error)
+        return _Step(
+            problem,
+            seen,
+            action,
+            commands,
+            self._setpoints.youngest(),
+            self._setpoints.youngest_image(),
+        )
+
     def _stop(self, action: NDArray[np.float32] | None) -> str:
         """Return why the episode is over, or ""."""
         if action is not None and not np.isfinite(action).all():
             return "the policy's action is not finite"
+        judged = self._client.judgement()
+        if judged.get("physics_error"):  # it also stops the arms
+            return "the physics diverged"
         for arm in names.ARMS:
             state, _ = self._robot.operating(arm.upper())
             if state in STOPS:
                 return f"{arm.upper()} is {state}: the robot was stopped"
-        judged = self._client.judgement()
-        if judged.get("physics_error"):
-            return "the physics diverged"
         return "the judge reports success" if judged.get("is_success") else ""
 
     def _sleep_until(self, due: float) -> None:
@@ -244,36 +278,30 @@ class Driver:
 
     # -- what is told ------------------------------------------------------------------------------
 
-    def _write(
-        self,
-        seed: int,
-        number: int,
-        seen: list[float],
-        action: NDArray[np.float32] | None,
-        commands: Mapping[str, Command],
-        problem: str,
-        latency: float | None,
-    ) -> None:
+    def _write(self, seed: int, number: int, step: _Step) -> None:
         """Write one line of the log: what was measured, commanded, sent, or held back and why."""
+        action = step.action
+        latency = None if action is None else step.latency
         line = {
             "time": time.time(),
             "episode": seed,
             "step": number,
             "phase": self._robot.phase,
-            "both_arms": seen,
+            "both_arms": step.seen,
             "action": None if action is None else np.asarray(action, np.float64).tolist(),
             "commands": {
                 arm: {"pose": list(command.pose), "jaw": command.jaw}
-                for arm, command in commands.items()
+                for arm, command in step.commands.items()
             },
-            "sent": self._config.sends and not problem,
-            "held": problem,
+            "sent": self._config.sends and not step.problem,
+            "held": step.problem,
             "latency_ms": None if latency is None else round(1e3 * latency, 3),
         }
         self._log.write(json.dumps(line) + "\n")
 
-    def _say(self, commands: Mapping[str, Command], problem: str) -> None:
+    def _say(self, step: _Step) -> None:
         """Say why nothing is sent when the reason changes, and in a dry run what would be sent."""
+        problem = step.problem
         kind = problem.translate(_WITHOUT_NUMBERS)
         now = time.monotonic()
         if kind != self._told:
@@ -284,7 +312,7 @@ class Driver:
         if self._config.sends or problem or time.monotonic() < self._next_line:
             return
         self._next_line = time.monotonic() + 1.0
-        for arm, command in commands.items():
+        for arm, command in step.commands.items():
             x, y, z = (1e3 * value for value in poses.position(command.pose))
             self._tell(
                 f"dry run, {self._robot.subtask}: {arm} would be sent to ({x:.1f}, {y:.1f}, "

@@ -2,9 +2,11 @@
 
 Before every control step `problem_of_inputs` checks that all inputs of the policy are there and
 fresh, and that the arms may be moved. `problem_of_target` checks that a set point to be sent is
-near enough to the present one and the measured pose, and not too fast. If either finds a problem,
-nothing is sent: a dVRK then stays at its last set point. `is_outside` says whether a tip would
-leave the workspace. The guards cannot be switched off; limits are numbers in a file.
+near enough to the present one and the measured pose, and not too fast. `problem_of_dead_man` checks
+the dead-man's switch before the policy acts, and again before its set points are sent. If any of
+them finds a problem, nothing is sent: a dVRK then stays at its last set point. `is_outside` says
+whether a tip would leave the workspace. The guards cannot be switched off; limits are numbers in a
+file.
 """
 
 import math
@@ -102,18 +104,22 @@ class Planned:
     base: Pose
 
 
-def problem_of_inputs(
-    inputs: Iterable[Input], states: dict[str, tuple[str, bool]], dead_man_age: float
-) -> str:
+def problem_of_dead_man(age: float) -> str:
+    """Return that the dead-man's switch is not held, or "".
+
+    Args:
+        age: time since the switch was last seen held [s].
+    """
+    return "the dead-man's switch is not held" if age > DEAD_MAN_S else ""
+
+
+def problem_of_inputs(inputs: Iterable[Input], states: dict[str, tuple[str, bool]]) -> str:
     """Return why nothing may be sent now, or "".
 
     Args:
         inputs: the policy's inputs.
         states: arm → its operating state and whether it is homed; "" if none has arrived.
-        dead_man_age: time since the dead-man's switch was last seen held [s].
     """
-    if dead_man_age > DEAD_MAN_S:
-        return "the dead-man's switch is not held"
     for arm, (state, is_homed) in states.items():
         if state != ENABLED:
             return f"{arm} is {state or 'silent about its operating state'}"

@@ -28,6 +28,7 @@ from surgicai_vision.robot.arm import (
     JAW_NAME,
     JOINT_NAMES,
     MAX_AGE_S,
+    STATE_COMMAND,
     Arm,
     ArmState,
     Endoscope,
@@ -52,6 +53,7 @@ from surgicai_vision.robot.messages import (
     StringStamped,
     TwistStamped,
 )
+from surgicai_vision.robot.operating_state import ENABLED
 from surgicai_vision.robot.recorder import Recorder
 from surgicai_vision.robot.simulated import PSM_NAMES, SimulatedRobot
 from surgicai_vision.robot.transport import Inbox, Publish, Received, Transport
@@ -125,6 +127,7 @@ class Server:
         recorder: records what clients do; None records nothing.
 
     Attributes:
+        steps: control steps taken so far, in all episodes.
         lateness: how late each control step of a real-time run began [s].
     """
 
@@ -138,6 +141,7 @@ class Server:
         self.robot = robot
         self._recorder = recorder
         self.config = config
+        self.steps = 0
         self.lateness: list[float] = []
         self._transport = transport
         max_age = MAX_AGE_S if config.clock == REAL else None
@@ -167,6 +171,7 @@ class Server:
         self._requests: list[_Request] = []
         self._taken: deque[tuple[int, str]] = deque(maxlen=REMEMBERED)
         self._shown: dict[str, tuple[str, bool, bool]] = {}
+        self._diverged: set[str] = set()  # PSMs that a reset enables again
         self._last_stamp = 0
         self._next_image = 0.0
         self._cameras: Cameras | None = None
@@ -262,6 +267,8 @@ class Server:
             arm.receive(channel, received.message, received.source, time.time_ns())
         except InputError as error:
             self._say(arm.name, "warning", f"rejected {channel}: {error}")
+        if channel == STATE_COMMAND:
+            self._diverged.discard(arm.name)  # whoever sent it decides from now on
         self._stamps[topic] = max(self._stamps.get(topic, 0), _stamp_of(received.message))
 
     def _texts(self, inbox: Inbox) -> list[_Request]:
@@ -327,20 +334,28 @@ class Server:
     def _move(self, halfway: Callable[[], None] | None) -> None:
         """Take one control step under the present set points."""
         self.robot.step(halfway)
+        self.steps += 1
         if self._recorder is not None:
             self._recorder.after_step()
         if self.robot.info["physics_error"]:
-            for psm in self._psms.values():
+            for name, psm in self._psms.items():
                 if psm.operating.may_move:
                     psm.stop("the physics diverged; request a reset")
+                    self._diverged.add(name)
 
     def _reset(self, seed: int) -> None:
-        """Begin another episode; arms that may move still obey, but forget earlier commands."""
+        """Begin another episode: arms forget earlier commands and keep their operating states.
+
+        Those that were stopped because the physics diverged are enabled again.
+        """
         self.robot.reset(seed)
         if self._recorder is not None:
             self._recorder.begin()
         for psm in self._psms.values():
             psm.forget()
+        for name in self._diverged:
+            self._psms[name].operating.state = ENABLED
+        self._diverged.clear()
         if self._images is not None:  # instead of the previous episode's next state
             self._images.offer(self.robot.env.get_state())
 

@@ -2,7 +2,7 @@
 
     problem = setpoints.problem_of_inputs()
     commands, problem = setpoints.of_action(action, now)
-    setpoints.send({} if problem else commands)
+    setpoints.send({} if problem else commands, now)
 
 An action is added to the set point that the robot itself publishes, as the envs add it to theirs.
 While the robot still publishes an earlier set point, because the last ones sent have not been
@@ -34,6 +34,7 @@ from surgicai_vision.robot.guards import (
     Input,
     Planned,
     TargetGuard,
+    problem_of_dead_man,
     problem_of_inputs,
 )
 from surgicai_vision.robot.messages import Header, JointState
@@ -96,8 +97,6 @@ class Setpoints:
         self._sends = sends
         self._is_stepped = is_stepped
         self._sent: dict[str, deque[_Sent]] = {}
-        self._heard: dict[str, Command] = {}
-        self._now = 0.0
 
     def forget(self) -> None:
         """Forget what was sent: an episode begins."""
@@ -116,7 +115,7 @@ class Setpoints:
         inputs += [Input(topic, self._age(topic), limits.max_image_age) for topic in images]
         moved_arms = self._robot.arms if arms is None else arms
         operating = {arm: self._robot.operating(arm) for arm in moved_arms}
-        return problem_of_inputs(inputs, operating, self._dead_man())
+        return problem_of_dead_man(self._dead_man()) or problem_of_inputs(inputs, operating)
 
     def _age(self, topic: str) -> float:
         """Return a message's age [s]; if we set the clock, all are of the last step."""
@@ -154,17 +153,15 @@ class Setpoints:
             moves: arm → seven increments in [-1, 1].
             now: time of the control step [s].
         """
-        self._now = now
         robot = self._robot
         commands: dict[str, Command] = {}
         for arm, values in moves.items():
             if len(values) != 7 or not all(map(math.isfinite, values)):
                 return {}, "the policy's action is not seven finite numbers"
             clipped = [min(max(value, -1.0), 1.0) for value in values]
-            told = self._present(arm)
-            commands[arm] = self._moved(told, clipped)
+            commands[arm] = self._moved(self._present(arm, now), clipped)
         if robot.release_steps:
-            commands[RELEASED] = self._released()
+            commands[RELEASED] = self._released(now)
         return self.guarded(commands, now)
 
     def of_targets(
@@ -178,12 +175,11 @@ class Setpoints:
             targets: arm → the set point to reach.
             now: time of the control step [s].
         """
-        self._now = now
         commands: dict[str, Command] = {}
         for arm, target in targets.items():
             if not all(map(math.isfinite, (*target.pose, target.jaw))):
                 return {}, "the policy's set points are not finite"
-            told = self._present(arm)
+            told = self._present(arm, now)
             pose = moved_towards(told.pose, target.pose, self._step_size)
             jaw = min(max(target.jaw, 0.0), JAW_OPEN)
             limit = self._step_size.jaw
@@ -194,13 +190,18 @@ class Setpoints:
     def guarded(
         self, commands: Mapping[str, Command], now: float
     ) -> tuple[Mapping[str, Command], str]:
-        """Return which set points would be sent at `now` [s], and why they may not be, or ""."""
-        self._now = now
+        """Return which set points would be sent at `now` [s], and why they may not be, or "".
+
+        The dead-man's switch counts as it is now: whoever decided on the commands took some time.
+        """
+        problem = problem_of_dead_man(self._dead_man())
+        if problem:
+            return commands, problem
         robot = self._robot
         planned = {}
         for arm, command in commands.items():
             base = robot.base_in(arm, self._limits.frame)
-            told = self._present(arm)
+            told = self._present(arm, now)
             plan = Planned(arm, told.pose, robot.measured(arm), command.pose, base)
             if self._guard.is_outside(plan):  # as in an env: the jaw moves, the tip does not
                 command = Command(told.pose, command.jaw)
@@ -217,36 +218,35 @@ class Setpoints:
         jaw = min(max(told.jaw + values[6] * self._step_size.jaw, 0.0), JAW_OPEN)
         return Command(moved(told.pose, values, self._step_size), jaw)
 
-    def _released(self) -> Command:
+    def _released(self, now: float) -> Command:
         """Return PSM2's next set point while it lets go (`Simulation._let_go`)."""
-        told = self._present(RELEASED)
+        told = self._present(RELEASED, now)
         jaw = min(told.jaw + RELEASE_JAW, RELEASE_OPEN)
         if jaw < RELEASE_OPEN:
             return Command(told.pose, jaw)
         return Command(poses.shifted_along_z(told.pose, -RELEASE_SHIFT), jaw)
 
-    def _present(self, arm: str) -> Command:
-        """Return an arm's present set point: as published, or as last sent while that is pending.
+    def _present(self, arm: str, now: float) -> Command:
+        """Return an arm's set point at `now` [s]: as published, or as sent while that is pending.
 
         The published one is drawn back towards the measured pose. The active arm continues from
         there; another arm continues from what was last sent, as long as that is near.
         """
         told = self._robot.told(arm)
-        self._heard[arm] = told
         sent = self._sent.get(arm)
         if not sent:
             return told
         last = sent[-1].command
         if arm != self._robot.active:
             return last if poses.distance(last.pose, told.pose) < SAME_M else told
-        waiting = [entry for entry in sent if entry.time >= self._now - PENDING_S]
+        waiting = [entry for entry in sent if entry.time >= now - PENDING_S]
         if not waiting or _is_same(told, last):
             return told
         before = [waiting[0].heard, *(entry.command for entry in waiting[:-1])]
         return last if any(_is_same(told, entry) for entry in before) else told
 
-    def send(self, commands: Mapping[str, Command]) -> None:
-        """Send commands, and take a control step if we set the clock."""
+    def send(self, commands: Mapping[str, Command], now: float) -> None:
+        """Send commands at `now` [s], and take a control step if we set the clock."""
         stamp = self._client.stamp()
         sent = []
         if self._sends:
@@ -262,8 +262,8 @@ class Setpoints:
                     self._client.send(topic, message)
                     sent.append(topic)
                 waiting = self._sent.setdefault(arm, deque())
-                waiting.append(_Sent(self._now, self._heard[arm], command))
-                while waiting[0].time < self._now - PENDING_S:
+                waiting.append(_Sent(now, self._robot.told(arm), command))
+                while waiting[0].time < now - PENDING_S:
                     waiting.popleft()
         if self._robot.release_steps and commands:
             self._robot.release_steps -= 1

@@ -26,20 +26,22 @@ class Gamepad:
     def __init__(self) -> None:
         self._axes = [0.0] * AXES
         self._buttons = [0.0] * BUTTONS
+        self._reported = [0.0] * BUTTONS
         self._events: list[str] = []
 
     def update(self, axes: Sequence[float], buttons: Sequence[float]) -> None:
         """Take over the current state; whatever shorter lists leave out is at rest."""
         self._axes = _filled(axes, AXES)
-        before = self._buttons
-        self._buttons = _filled(buttons, BUTTONS)
+        before = self._reported
+        self._buttons = self._reported = _filled(buttons, BUTTONS)
         for index, event in PRESSES.items():
             if before[index] < PRESSED <= self._buttons[index]:
                 self._events.append(event)
 
     def release_all(self) -> None:
-        """Release everything: the gamepad is gone."""
-        self.update((), ())
+        """Release everything until the next `update`, which presses no button that was down."""
+        self._axes = [0.0] * AXES
+        self._buttons = [0.0] * BUTTONS
 
     def poll(self) -> Input:
         """Return the current deflections, and the buttons pressed since the last call."""

@@ -19,6 +19,7 @@ from surgicai_vision.core.files import TEMPORARY, check_output, locked
 from surgicai_vision.demos.store import (
     MARKER,
     Demo,
+    is_same_request,
     list_demos,
     read_demo,
     read_marker,
@@ -58,7 +59,9 @@ class Recordings:
         return max(used, default=int(self._request["seed"]) - 1) + 1
 
     def keep(self, demo: Demo) -> Path:
-        """Write an episode, whole or not at all."""
+        """Write an episode, whole or not at all; the folder has a marker before its first one."""
+        if not (self.folder / MARKER).exists():
+            self._write_marker()
         path = write_demo(self.folder, len(self.seeds), demo)
         self.seeds.append(demo.seed)
         self._write_marker()
@@ -127,7 +130,7 @@ def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -
     stored = marker.get("request")
     if seed is None and isinstance(stored, dict):
         request["seed"] = stored.get("seed", 0)
-    if stored != request:
+    if not is_same_request(stored, request):
         raise OutputExists(
             f"--out {folder} holds demonstrations of another command, task or scene "
             f"(see {folder / MARKER}); give another folder."

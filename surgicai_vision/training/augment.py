@@ -76,7 +76,11 @@ def with_shift(
 
 
 def _overlap(move: int, length: int) -> tuple[slice, slice]:
-    """Return the target and the source slice of an axis that is shifted."""
+    """Return the target and the source slice of an axis of `length` places shifted by `move`.
+
+    Both are empty if the shift leaves nothing of the axis.
+    """
+    move = min(max(move, -length), length)
     low = max(move, 0)
     high = length + min(move, 0)
     return slice(low, high), slice(low - move, high - move)

@@ -93,7 +93,8 @@ def _from_demos(dataset: Dataset, folder: Path) -> Timeline:
         np.repeat(np.arange(len(shown)), lengths), np.concatenate([demo.phase for demo in shown])
     )
     seconds = np.asarray(dataset.columns()["timestamp"], np.float64)
-    within = np.rint(seconds * names.FPS).astype(np.int64)
+    control_steps = np.rint(seconds * names.FPS).astype(np.int64)
+    within = control_steps // dataset.config.action_repeat
     step = begins[np.asarray(dataset.demonstration_index)] + within
     return Timeline(np.concatenate([demo.action for demo in shown]), *runs, step)
 
@@ -151,7 +152,7 @@ def _runs(
     return starts[run].astype(np.int64), ends[run].astype(np.int64)
 
 
-def earlier_rows(dataset: Dataset, moments: int) -> NDArray[np.int64]:
+def earlier_rows(dataset: Dataset, moments: int, spacing: int) -> NDArray[np.int64]:
     """Return the rows of the frames that a policy with a history sees, (N, moments) int64.
 
     The present frame is the last; at the start of a run the first frame is repeated.
@@ -159,10 +160,11 @@ def earlier_rows(dataset: Dataset, moments: int) -> NDArray[np.int64]:
     Args:
         dataset: its frames are evenly spaced within a run.
         moments: number of observations that the policy sees.
+        spacing: control steps from one frame of a run to the next.
     """
     index = np.asarray(dataset.episode_index)
     times = np.rint(np.asarray(dataset.columns()["timestamp"], np.float64) * names.FPS)
-    breaks = (np.diff(index) != 0) | (np.diff(times) != names.FPS // dataset.fps)
+    breaks = (np.diff(index) != 0) | (np.diff(times) != spacing)
     starts = np.concatenate([[0], np.flatnonzero(breaks) + 1])
     first = starts[np.cumsum(np.concatenate([[0], breaks]))]
     wanted = np.arange(len(index))[:, None] - np.arange(moments)[::-1]

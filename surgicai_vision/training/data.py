@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import clock
 from surgicai_vision.core.errors import check_name
+from surgicai_vision.core.runs import first_of_group
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.training.visits import stages
 
@@ -82,9 +83,8 @@ def _first_variants(
     episode_index: NDArray[np.int64], demonstration_index: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Return the row of every frame's counterpart in its demonstration's first variant, (N,)."""
-    position = np.arange(len(episode_index)) - np.searchsorted(episode_index, episode_index)
-    first: NDArray[np.int64] = np.searchsorted(demonstration_index, demonstration_index) + position
-    return first
+    position = np.arange(len(episode_index)) - first_of_group(episode_index)
+    return first_of_group(demonstration_index) + position
 
 
 def cuts(count: int, size: int) -> list[int]:

@@ -70,6 +70,8 @@ def model_card(
     from huggingface_hub import EvalResult, ModelCardData
 
     task = checkpoint.task.task
+    # "bc" as an algorithm clones demonstrations too.
+    learning = "imitation" if checkpoint.run.algo in (None, "bc") else "reinforcement"
     results = None
     if successes is not None:
         rate = EvalResult(
@@ -85,7 +87,7 @@ def model_card(
         license=licence,
         library_name="surgicai-vision",
         pipeline_tag="robotics",
-        tags=["surgical-robotics", "suturing", "imitation-learning"],
+        tags=["surgical-robotics", "suturing", f"{learning}-learning"],
         model_name=repo.partition("/")[2],
         eval_results=results,
     )
@@ -102,7 +104,7 @@ def model_card(
 
 {task_text(task)}
 
-A policy for the task `{task}` in simulated robotic suturing, trained by imitation with
+A policy for the task `{task}` in simulated robotic suturing, trained by {learning} learning with
 surgicai-vision ({checkpoint.code_version}). It is not a medical device.
 
 | | |

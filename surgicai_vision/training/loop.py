@@ -75,7 +75,8 @@ class Training:
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
         self.target = torch.from_numpy(target.astype(kind))
         history = self.policy.history
-        self.seen = earlier_rows(request.dataset, history) if history > 1 else None
+        spacing = request.recipe.frame_stride
+        self.seen = earlier_rows(request.dataset, history, spacing) if history > 1 else None
         if start is None:
             self._measure()
             self.policy.measure(self.target[self.rows])

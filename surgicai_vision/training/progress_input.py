@@ -73,12 +73,14 @@ def with_progress(
         policy: predicts the progress; one that `check_progress_policy` accepts.
         features: of the dataset's frames as the policy sees them, one entry per view.
     """
-    arms = np.asarray(dataset.columns()[names.BOTH_ARMS], np.float32)
+    columns = dataset.columns()
+    keys = policy.inputs.vector or (names.STATE,)
+    vectors = np.concatenate([np.asarray(columns[key], np.float32) for key in keys], axis=1)
     progress = []
     for at in range(0, dataset.length, ROWS):
         rows = slice(at, at + ROWS)
         seen = [np.asarray(entry.rows[rows], np.float32) for entry in features]
-        answers = policy.act(np.concatenate(seen, axis=1) if seen else None, arms[rows])
+        answers = policy.act(np.concatenate(seen, axis=1) if seen else None, vectors[rows])
         progress.append(answers[:, PROGRESS_AT:])
     return DatasetSubset(
         dataset,

@@ -108,9 +108,8 @@ def test_help_of_all_imports_no_command():
         "print(sorted(name for name in sys.modules if name.startswith(package)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == str(
-        ["surgicai_vision.commands.main", "surgicai_vision.commands.options"]
-    )
+    helpers = ("main", "options", "os_errors")
+    assert done.stdout.strip() == str([f"surgicai_vision.commands.{name}" for name in helpers])
 
 
 def test_no_arguments_show_help_and_fail(capsys):
@@ -162,6 +161,8 @@ def test_version(capsys):
         (["render-demos", "--view", ""], "--view is empty"),
         (["render-demos", "--demos", "missing"], "missing"),
         (["render-demos", "--demos", "missing", "--episodes", "3"], "nothing is recorded"),
+        (["render-demos", "--demos", "missing", "--seed", "3"], "nothing is recorded"),
+        (["render-demos", "--distractors", "0"], "'0' for --distractors. Must be >= 1"),
         (["record-demos", "--episodes", "-3"], "'-3' for --episodes. Must be >= 1"),
         (["record-demos", "--noise", "-0.1"], "Invalid value '-0.1' for --noise. Must be >= 0"),
         (["record-demos", "--executor", "rai"], "Did you mean 'ray'?"),
@@ -186,8 +187,9 @@ def test_version(capsys):
         (["sweep", "smok"], "Did you mean 'smoke'?"),
         (["scene", "--sheet", "sheet.bmp"], "'.bmp'"),
         (["quickstart", "--config", "missing.yaml"], "missing.yaml"),
+        (["quickstart", "--size", "2000"], "'2000' for --size. Must be <= 960"),
         (["train", "--seed", str(2**63)], f"for --seed. Must be <= {2**63 - 1}"),
-        (["train", "--encoder", "none", "--algo", "td3", "--seed", str(2**32)], "at most"),
+        (["train", "--algo", "td3", "--seed", str(2**32)], "at most"),
         (["evaluate", "zero", "--out", "x" * 300], "File name too long"),
         (["sweep", "smoke", "--out", "x" * 300], "File name too long"),
         (["leaderboard", ".", "--out", "x" * 300 + ".html"], "File name too long"),

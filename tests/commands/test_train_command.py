@@ -1,10 +1,12 @@
 """`train`: every option given is read or refused, and every folder is checked before any work."""
 
+import dataclasses
+
 import pytest
 import yaml
 from helpers.checkpoints import checkpoint
 
-from surgicai_vision.commands import folders
+from surgicai_vision.commands import folders, train
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
@@ -24,18 +26,35 @@ def own_folder(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("seeds: 3", "--seeds is for --algo"),
-        ("env: {hold_jaw: true}", "env is for --algo"),
-        ("env_steps: 100", "--env-steps is for --algo"),
-        ("observation: state", "--observation is for --algo"),
-        ("validation: 5", "--validation is for --algo"),
+        ("seeds: 3", "--seeds is not read by imitation from a dataset, only by an online"),
+        ("env: {hold_jaw: true}", "env is not read by imitation"),
+        ("env_steps: 100", "only by an online --algo, --residual-on: leave it out"),
+        ("observation: state", "--observation is not read by imitation"),
+        ("validation: 5", "--validation is not read by imitation"),
+        ("workers: 2", "--workers is not read by imitation"),
+        ("decisions: 9", "--decisions is not read by imitation from a dataset, only by --low"),
+        ("algo: td3\nencoder: random", "--encoder is not read by an online --algo"),
+        ("algo: td3\nupdates: 9", "only by an offline --algo"),
+        ("algo: td3\nlog: wandb", "--log wandb is for imitation"),
+        ("algo: bc\nenv_steps: 9", "--env-steps is not read by an offline --algo"),
+        ("algo: bc\nweights: [a.bin]", "--weights is not read by an offline --algo"),
+        ("algo: ppo\nlow: a.yaml\nobservation: state", "--observation is not read by --low"),
+        ("algo: ppo\nlow: a.yaml\nenv_steps: 9", "--env-steps is not read by --low"),
+        ("algo: ppo\nlow: a.yaml\nresidual_on: b", "--residual-on is not read by --low"),
+        ("algo: td3\nresidual_on: a\nlog: none", "--log is not read by --residual-on"),
+        ("algo: td3\nresidual_on: a\ntask: place", "--task is not read by --residual-on"),
     ],
 )
-def test_what_imitation_does_not_read_is_refused(text, said, tmp_path, capsys):
+def test_what_a_way_of_training_does_not_read_is_refused(text, said, tmp_path, capsys):
     (tmp_path / "train.yaml").write_text(text)
-    assert main(["train", "--encoder", "none", "--config", "train.yaml"]) == 2
+    assert main(["train", "--config", "train.yaml"]) == 2
     error = capsys.readouterr().err
     assert said in error and len(error.strip().splitlines()) == 1
+
+
+def test_every_option_is_read_by_some_way_of_training():
+    read = [option for options in train.READ.values() for option in options]
+    assert set(read) == {field.name for field in dataclasses.fields(train.Options)}
 
 
 def test_imitation_takes_the_first_demonstrations_it_is_told_to(tmp_path, capsys):
@@ -50,6 +69,23 @@ def test_imitation_takes_the_first_demonstrations_it_is_told_to(tmp_path, capsys
     assert counts == [1, 2]
     assert main([*given, "--demonstrations", "3", "--out", "more"]) == 2
     assert "holds 2" in capsys.readouterr().err and not (tmp_path / "more").exists()
+
+
+def test_a_checkpoint_is_named_by_the_task_of_its_data(tmp_path, capsys):
+    record(TaskConfig("place"), episodes=1, out=tmp_path / "demos", context=RunContext(0))
+    render_demos(
+        tmp_path / "demos", tmp_path / "dataset", views=("back",), size=32, context=RunContext(0)
+    )
+    given = ["train", "--encoder", "none", "--dataset", "dataset", "--epochs", "1"]
+    assert main([*given, "--task", "grasp"]) == 2
+    assert "--task grasp: dataset shows place" in capsys.readouterr().err
+    assert not (tmp_path / "outputs").exists()
+    assert main(given) == 0
+    made = [path.name for path in (tmp_path / "outputs/train").iterdir()]
+    assert made and all(name.startswith("place-proprioception-") for name in made)
+    given = ["train", "--algo", "bc", "--demos", "demos", "--task", "grasp"]
+    assert main(given) == 2
+    assert "--task grasp: demos shows place" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--low", "--residual-on"])
@@ -78,3 +114,23 @@ def test_the_folder_of_every_seed_is_checked_before_the_first_is_trained(
     monkeypatch.setattr("surgicai_vision.rl.residual.train_residual", train)
     assert main(["train", *given[option], "--seeds", "2"]) == 2
     assert len(set(checked)) == 2 and "already holds files" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--low", "--residual-on"])
+def test_the_weights_given_are_those_of_the_policies_that_are_kept(
+    option, tmp_path, monkeypatch, capsys
+):
+    low = {**dict.fromkeys(names.SUBTASKS, "expert"), "hlp": "order", "termination": "privileged"}
+    (tmp_path / "low.yaml").write_text(yaml.safe_dump({**low, "insert": "released:insert"}))
+    given = {
+        "--low": ["--task", "suture", "--algo", "ppo", "--low", "low.yaml"],
+        "--residual-on": ["--algo", "td3", "--residual-on", "released:grasp"],
+    }
+
+    def begin(*arguments):
+        raise AssertionError("begun")
+
+    monkeypatch.setattr("surgicai_vision.rl.high_level.begin", begin)
+    monkeypatch.setattr("surgicai_vision.rl.residual.begin", begin)
+    assert main(["train", *given[option], "--weights", "nowhere.bin"]) != 0
+    assert "nowhere.bin" in capsys.readouterr().err

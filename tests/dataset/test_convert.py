@@ -99,6 +99,18 @@ def test_video_is_read_by_us_and_by_lerobot_and_its_error_is_measured(tmp_path, 
         render(demos, tmp_path / "video")
 
 
+def test_a_dataset_that_was_replaced_is_encoded_anew(tmp_path, demos):
+    """Regression: in one process, the videos showed the dataset that had been there before."""
+    render(demos, tmp_path / "set", video="h264")
+    shutil.rmtree(tmp_path / "set")
+    others = write_demos(tmp_path / "others", CONFIG, (5, 6, 7))
+    render(others, tmp_path / "set", video="h264")
+    assert check_dataset(tmp_path / "set").problems == ()
+    render(others, tmp_path / "images")
+    shown = open_dataset(tmp_path / "set").frames("front").astype(int)
+    assert np.abs(shown - open_dataset(tmp_path / "images").frames("front")).mean() < 4
+
+
 def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
     tmp_path, demos, monkeypatch
 ):

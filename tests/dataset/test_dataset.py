@@ -1,5 +1,6 @@
 """Datasets: rendered from states, LeRobot's format, nothing lost."""
 
+import dataclasses
 import json
 import re
 import struct
@@ -133,6 +134,26 @@ def test_every_fifth_frame_is_one_of_all(tmp_path, fake, demos, monkeypatch):
         open_policy("replay", dataset=few)
 
 
+def test_frames_of_held_actions_are_that_many_control_steps_apart(tmp_path, fake):
+    held = dataclasses.replace(CONFIG, action_repeat=2)
+    demos = write_demos(tmp_path / "demos", held, (1, 2))
+    for stride, fps in ((1, 25), (5, 5)):
+        render(demos, tmp_path / f"every{stride}", frame_stride=stride)
+        dataset = open_dataset(tmp_path / f"every{stride}")
+        assert dataset.fps == fps and dataset.config.action_repeat == 2
+        columns = dataset.columns()
+        seconds = columns["frame_index"] * 2 * stride / names.FPS
+        np.testing.assert_allclose(columns["timestamp"], seconds, atol=1e-6)
+        assert check_dataset(dataset.path).problems == ()
+        assert with_frame_stride(dataset, 2 * stride) is dataset
+    assert open_policy("replay", dataset=open_dataset(tmp_path / "every1")).name == "replay"
+    with pytest.raises(InputError, match="a replay needs one for each step: 25"):
+        open_policy("replay", dataset=open_dataset(tmp_path / "every5"))
+    uneven = write_demos(tmp_path / "uneven", dataclasses.replace(CONFIG, action_repeat=4), (1, 2))
+    with pytest.raises(InputError, match="a frame every 4 control steps"):
+        render(uneven, tmp_path / "none")
+
+
 def test_frames_across_episodes_equal_single_frames(tmp_path, fake, demos):
     render(demos, tmp_path / "set")
     dataset = open_dataset(tmp_path / "set")
@@ -216,6 +237,7 @@ def test_bad_requests_are_refused_before_any_work(tmp_path, demos):
         (["--size", "63", "--video", "h264"], "size is 63"),
         (["--layout", "open-h", "--video", "h264"], "convert_image_to_video"),
         (["--layout", "open-h", "--frame-stride", "5", "--config", "held.yaml"], "for 20 control"),
+        (["--config", "held.yaml"], "a frame every 4 control steps"),
     ],
 )
 def test_the_command_refuses_them_before_it_records(tmp_path, monkeypatch, capsys, wrong, said):

@@ -13,6 +13,7 @@ from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import open_dataset, open_h, render_demos
+from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.store import Demo, list_demos, read_demo
 from surgicai_vision.envs.absolute import setpoints
@@ -125,6 +126,11 @@ def test_what_it_is_not_for_is_refused(demos: Path, dataset: Path, tmp_path: Pat
     held = record(slow, episodes=1, out=tmp_path / "held", context=RunContext(0))
     with pytest.raises(InputError, match="frame_stride is 10 and action_repeat 2"):
         render_demos(held[0].parent, tmp_path / "rendered", layout="open-h", frame_stride=10)
+    assert not (tmp_path / "rendered.work").exists()
+    shaken = {"out": tmp_path / "shaken", "disturbance": Disturbance(noise=0.3)}
+    noisy = record(TaskConfig("place"), episodes=1, context=RunContext(0), **shaken)
+    with pytest.raises(InputError, match="not the demonstrator's labels"):
+        render_demos(noisy[0].parent, tmp_path / "rendered", layout="open-h")
     assert not (tmp_path / "rendered.work").exists()
     with pytest.raises(UnknownName, match="layout"):
         render_demos(demos, tmp_path / "layout", layout="suturebot")

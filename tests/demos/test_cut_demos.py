@@ -9,11 +9,13 @@ import pytest
 from surgicai_vision import envs
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import DWELL, TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
 from surgicai_vision.dataset import open_dataset, render_demos
 from surgicai_vision.demos.cut import SHORTEST, cut_demos, visits
+from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.record import record
+from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_demo, write_marker
 
 GRASP, PLACE, INSERT = range(3)
@@ -74,6 +76,24 @@ def test_the_visits_of_all_subtasks_make_up_a_procedure(procedures):
     whole = read_demo(list_demos(procedures)[0])
     parts = [visit for subtask in names.SUBTASKS for visit in visits(whole, subtask)]
     np.testing.assert_array_equal(np.concatenate([part.action for part in parts]), whole.action)
+
+
+@pytest.mark.parametrize("reward", ["sparse", "dense"])
+def test_reward_and_success_are_the_subtasks_own(reward):
+    """A subtask goes on for `DWELL` steps after its success; the last one ends the procedure."""
+    env = envs.make(TaskConfig(names.SUTURE, reward=reward))
+    whole = rollout(env, Expert(env), 1).demo
+    for subtask in names.SUBTASKS[:-1]:
+        (visit,) = visits(whole, subtask)
+        assert np.flatnonzero(visit.success).tolist() == list(range(len(visit)))[-DWELL:]
+        recorded = whole.reward[whole.phase == names.SUBTASKS.index(subtask)]
+        expected = visit.success - 1.0 if reward == "sparse" else recorded
+        np.testing.assert_array_equal(visit.reward, expected.astype(np.float32))
+    (last,) = visits(whole, names.SUBTASKS[-1])
+    np.testing.assert_array_equal(last.success, whole.success[-len(last) :])
+    np.testing.assert_array_equal(last.reward, whole.reward[-len(last) :])
+    with pytest.raises(InputError, match="recorded in another scene"):
+        visits(dataclasses.replace(whole, scene_hash="0" * 64), "grasp")
 
 
 def test_cut_demonstrations_are_rendered_beside_a_subtasks_own(procedures, tmp_path, capsys):

@@ -146,9 +146,12 @@ def test_an_episode_goes_on_after_its_success():
 
 
 class Patient(FakeEnv):
-    """An env that reports no success while a push lasts."""
+    """An env that reports no success while a push lasts, and counts its steps over all resets."""
+
+    taken = 0
 
     def step(self, action):
+        self.taken += 1
         seen, reward, success, truncated, info = super().step(action)
         success &= self.state[2] > 25
         return seen, reward, success, truncated, {**info, "is_success": success}
@@ -156,15 +159,16 @@ class Patient(FakeEnv):
 
 def test_a_recovery_starts_elsewhere_and_its_push_is_not_recorded():
     env = Patient(dataclasses.replace(CONFIG, max_steps=60))
-    pushed = [
-        rollout(
-            env, FakeExpert(env), seed, disturbance=Disturbance(perturb_start_fraction=0.5)
-        ).demo
-        for seed in range(20)
-    ]
-    starts = [int(demo.state[0, 2]) for demo in pushed]
-    assert 4 <= sum(start > 0 for start in starts) <= 16
-    assert {start for start in starts if start} <= set(range(8, 26))
+    disturbance = Disturbance(perturb_start_fraction=0.5)
+    pushes = []
+    for seed in range(20):
+        env.taken = 0
+        demo = rollout(env, FakeExpert(env), seed, disturbance=disturbance).demo
+        pushes.append(env.taken - len(demo))
+        assert (demo.state[0, 1] != 0.0) == (pushes[-1] > 0)
+        assert demo.state[0, 2] == 0, "steps count from the first state that is recorded"
+    assert 4 <= sum(push > 0 for push in pushes) <= 16
+    assert {push for push in pushes if push} <= set(range(8, 26))
     # A push that ends the episode is undone: the start stays as it was.
     short = FakeEnv(CONFIG)
     for seed in range(20):
@@ -310,6 +314,23 @@ def test_record_again_does_nothing_and_another_request_is_refused(tmp_path, fake
     assert [path.stat().st_mtime_ns for path in first] == before
     with pytest.raises(OutputExists, match="another command"):
         record(CONFIG, episodes=3, out=out, context=RunContext(0))
+
+
+def test_a_folder_from_before_the_config_gained_a_field_is_the_same(tmp_path, fake):
+    out = tmp_path / "demos"
+    first = record(CONFIG, episodes=2, out=out, context=RunContext(0))
+    marker = read_marker(out)
+    del marker["request"]["task"]["scene"]["ink"]
+    write_json(out / "demos.json", marker)
+    assert record(CONFIG, episodes=2, out=out, context=RunContext(0)) == first
+    marker["request"]["task"]["scene"]["ink"] = "due"
+    write_json(out / "demos.json", marker)
+    with pytest.raises(OutputExists, match="another command"):
+        record(CONFIG, episodes=2, out=out, context=RunContext(0))
+    marker["request"]["task"]["scene"]["unknown"] = 1
+    write_json(out / "demos.json", marker)
+    with pytest.raises(OutputExists, match="another command"):
+        record(CONFIG, episodes=2, out=out, context=RunContext(0))
 
 
 def test_record_continues_where_it_was_stopped(tmp_path, fake, monkeypatch):

@@ -229,6 +229,19 @@ def demonstrated(tmp_path_factory):
     return paths
 
 
+def test_jaws_that_stay_closed_after_the_success_change_nothing():
+    """Regression: they counted as jaws that open, and closed jaws were learned."""
+    env = envs.make(TaskConfig("grasp"))
+    plain, longer = (
+        fit.fit_subtask("grasp", [rollout(env, Expert(env), 3, post_success_steps=steps).demo])
+        for steps in (0, 20)
+    )
+    assert longer.jaw_opening == plain.jaw_opening > 0.2
+    assert longer.grasp_angle == plain.grasp_angle
+    assert fit.closing(np.array([0.5, 0.5, 0.4, 0.2, 0.0, 0.0, 0.0])) == 1
+    assert fit.closing(np.zeros(4)) == 3, "jaws that never move"
+
+
 @pytest.mark.parametrize("task", list(envs.SUBTASKS))
 def test_one_demonstration_teaches_other_starts(demonstrated, task):
     env = envs.make(TaskConfig(task))
@@ -274,6 +287,16 @@ def test_reset_begins_anew_and_the_same_start_gives_the_same_actions(demonstrate
     np.testing.assert_array_equal(*runs)
     assert runs[0].dtype == np.float32
     assert np.abs(runs[0]).max() <= 1.0
+
+
+def test_a_file_that_was_replaced_is_learned_anew(demonstrated, tmp_path):
+    env = envs.make(TaskConfig("insert"))
+    demo = read_demo(demonstrated["insert"])
+    path = write_demo(tmp_path, 0, demo)
+    first = DmpController(env, [path]).fit
+    assert DmpController(env, [path]).fit is first
+    path.write_bytes(write_demo(tmp_path, 1, dataclasses.replace(demo, seed=77)).read_bytes())
+    assert DmpController(env, [path]).fit is not first
 
 
 def test_refuses_demonstrations_that_do_not_fit(demonstrated, tmp_path):

@@ -156,6 +156,17 @@ def test_the_nearest_start_is_its_own_and_random_ones_are_drawn_from_the_seed(so
     assert set(drawn) == set(digests)
 
 
+def test_a_source_is_read_once_and_again_when_its_file_was_replaced(sources, tmp_path):
+    one, other = (path.read_bytes() for path in sources["place"])
+    path = tmp_path / "episode_000000.safetensors"
+    path.write_bytes(one)
+    first = cuts.read_source(str(path))
+    assert cuts.read_source(str(path)) is first
+    path.write_bytes(other)
+    again = cuts.read_source(str(path))
+    assert again.digest == cuts.read_source(str(sources["place"][1])).digest != first.digest
+
+
 def test_attempts_keep_their_times_and_go_on_after_success(tmp_path):
     (path,) = demonstrate(tmp_path, "grasp", "search", 1)
     env = envs.make(TaskConfig("grasp"))

@@ -22,6 +22,7 @@ from surgicai_vision.core.config import (
     clock,
 )
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance
 from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.search_expert import SearchExpert
 from surgicai_vision.envs.geometry import Stitch
@@ -87,6 +88,19 @@ def test_its_demonstrations_show_every_attempt() -> None:
     assert len(rollout(other, SearchExpert(other), 500_000, "search").demo) < other.config.max_steps
 
 
+def test_its_attempts_are_counted_from_where_the_recording_begins() -> None:
+    """Regression: the steps of an unrecorded perturbation counted, but not for a policy's clock."""
+    env = envs.make(TaskConfig("grasp"))
+    opens = []
+    for disturbance in (UNDISTURBED, Disturbance(perturb_start_fraction=1.0)):
+        demo = rollout(env, SearchExpert(env), 500_000, "search", disturbance).demo
+        env.set_state_vector(demo.state[0])
+        state = env.simulation.task_state
+        assert (state.steps, state.tip_path) == (0, 0.0)
+        opens.append(np.flatnonzero(np.diff(demo.action[60:, 6] > 0.5).astype(int) > 0).tolist())
+    assert opens[0] == opens[1] and len(opens[0]) >= 3
+
+
 def test_the_clock_tells_steps_apart_and_comes_round() -> None:
     told = clock(np.arange(SUBTASK_STEPS))
     assert told.shape == (SUBTASK_STEPS, CLOCK_SIZE) and told.dtype == np.float32
@@ -125,6 +139,9 @@ def test_a_policy_with_a_clock_acts_by_it(tmp_path: Path) -> None:
     assert np.mean(early[:18]) < -0.3 and np.mean(early[22:]) > 0.3
     agent.restart(0)
     assert agent.act([0], [Still()], [None])[0, 0] == early[0]
+    held = PolicyAgent("held", policy, None, (), 224, policy.inputs.vector, action_repeat=2)
+    held.reset(0, Still(), 0)
+    assert [held.act([0], [Still()], [None])[0, 0] for _ in range(20)] == early[::2]
 
 
 def test_a_clock_goes_with_proprioception() -> None:

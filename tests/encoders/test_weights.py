@@ -1,5 +1,6 @@
 """Weights: where they are found, which files are refused, and every loader on a whole file."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from safetensors.torch import load_file, save_file
 from encoders import imagenet, weights
 from encoders.base import Encoder
 from surgicai_vision.core.errors import BadFile, InputError, MissingWeights, UnknownName
+from surgicai_vision.core.files import sha256_file
 from surgicai_vision.features.encoders import (
     WeightsSource,
     encoder_card,
@@ -90,6 +92,16 @@ def test_any_timm_network(tmp_path: Path) -> None:
     assert encoder.card.dim == encoder.dim == 512 and encoder.card.licence
     with pytest.raises(UnknownName, match="resnet1"):
         load_encoder("timm:resnet19")
+
+
+def test_a_timm_head_with_a_hidden_layer_gives_its_output(tmp_path: Path) -> None:
+    save_file(table_of(timm.create_model("mobilenetv3_small_100")), tmp_path / "m.safetensors")
+    encoder = load_encoder(
+        "timm:mobilenetv3_small_100.lamb_in1k",
+        weights=WeightsSource.of(tmp_path / "m.safetensors"),
+    )
+    assert encoder.card.dim == encoder.dim == 1024
+    assert encoder(hopper()).shape == (1, 1024)
 
 
 def assert_stable(encoder: Encoder, dim: int) -> None:
@@ -176,6 +188,22 @@ def test_order_and_hash_of_the_weights_folder(
     (tmp_path / "r3m" / "pytorch_model.bin").write_bytes(b"tampered")
     with pytest.raises(BadFile, match=str(encoder_card("r3m").sha256)):
         find_weights("r3m")
+
+
+def test_a_bare_filename_is_taken_only_by_its_hash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Many networks publish their weights as model.safetensors or pytorch_model.bin."""
+    monkeypatch.setenv(weights.FOLDER_VARIABLE, str(tmp_path))
+    for filename in ("model.safetensors", "pytorch_model.bin"):
+        (tmp_path / filename).write_bytes(b"weights of another network")
+    for name in ("timm:resnet18.a1_in1k", "imagenet", "r3m-18", "r3m"):
+        with pytest.raises(MissingWeights, match=f"as {name}"):
+            find_weights(name)
+    published = dataclasses.replace(
+        encoder_card("dinov2"), sha256=sha256_file(tmp_path / "model.safetensors")
+    )
+    assert weights.find(published, None, False, ()) == tmp_path / "model.safetensors"
 
 
 def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:

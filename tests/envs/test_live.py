@@ -180,29 +180,30 @@ def test_commands_come_in_order_and_once(page):
 
 
 @pytest.mark.parametrize(
-    "content",
+    ("content", "problem"),
     [
-        None,
-        [],
-        {},
-        {"command": "fly"},
-        {"command": 3},
-        {"command": ["play"]},
-        {"command": "play", "numbers": [1]},
-        {"command": "speed", "numbers": [3]},
-        {"command": "speed", "numbers": ["1"]},
-        {"command": "turn", "numbers": [1]},
-        {"command": "turn", "numbers": [1, float("nan")]},
-        {"command": "zoom", "numbers": [0]},
-        {"command": "views", "views": []},
-        {"command": "views", "views": ["front", "front"]},
-        {"command": "views", "views": ["nowhere"]},
-        {"command": "views", "views": list(camera_names())[:7]},
-        {"command": "play", "views": ["front"]},
+        (None, "must be a table"),
+        ([], "must be a table"),
+        ({}, "must be one of"),
+        ({"command": "fly"}, "must be one of"),
+        ({"command": 3}, "must be one of"),
+        ({"command": ["play"]}, "must be one of"),
+        ({"command": "play", "numbers": [1]}, "a list of length 0"),
+        ({"command": "speed", "numbers": [3]}, "speed must be one of"),
+        ({"command": "speed", "numbers": ["1"]}, "between -1000 and 1000"),
+        ({"command": "turn", "numbers": [1]}, "a list of length 2"),
+        ({"command": "turn", "numbers": [1, float("nan")]}, "between -1000 and 1000"),
+        ({"command": "zoom", "numbers": [0]}, "0.1 to 10"),
+        ({"command": "views", "views": []}, "must name a view"),
+        ({"command": "views", "views": ["front", "front"]}, "each once"),
+        ({"command": "views", "views": ["nowhere"]}, "must be among"),
+        ({"command": "views", "views": [["front"]]}, "must be among"),
+        ({"command": "views", "views": list(camera_names())[:7]}, "at most 6"),
+        ({"command": "play", "views": ["front"]}, "no other command"),
     ],
 )
-def test_what_is_no_command_is_refused(page, content):
-    with pytest.raises(InputError):
+def test_what_is_no_command_is_refused(page, content, problem):
+    with pytest.raises(InputError, match=problem):
         page.receive(content)
     assert page.commands() == []
 

@@ -2,6 +2,7 @@
 
 import json
 
+import av
 import numpy as np
 import pytest
 
@@ -65,6 +66,29 @@ def test_a_video_shows_every_second_state_and_the_outcome_at_the_end(tmp_path):
     line = video[-1, 96, 20:620].astype(int)
     assert np.abs(line - GOOD).max() < 40, "a success ends under a green line"
     assert np.abs(video[0, 96, 20:620].astype(int) - GOOD).min(axis=0).max() > 20
+
+
+def test_a_held_action_changes_no_time(tmp_path):
+    config = TaskConfig("handoff", max_steps=20, action_repeat=5)
+    filming = Filming(tmp_path, look=SMALL)
+    (episode,) = evaluate(ZeroAgent, config, [900], workers=1, filming=filming)
+    assert episode.row.steps == 20
+    assert episode.film.steps.tolist() == [0, 5, 10, 15, 20]
+    (name,) = names_in(tmp_path)
+    with av.open(str(tmp_path / name)) as video:
+        assert video.streams.video[0].average_rate == 5, "an image every 10 of 50 control steps"
+        shown = video.streams.video[0].frames
+    assert shown == 2 + round(5 * LAST_S)
+
+
+def test_a_video_that_another_policy_left_is_not_listed(tmp_path):
+    config = TaskConfig("handoff", max_steps=2)
+    evaluate(ZeroAgent, config, [900], workers=1, filming=Filming(tmp_path, look=SMALL))
+    (left,) = names_in(tmp_path)
+    (tmp_path / "videos.json").write_text('{"videos": []}')  # it was killed before its list
+    filming = Filming(tmp_path, "successes", SMALL)
+    evaluate(ZeroAgent, config, [900], workers=1, filming=filming)
+    assert names_in(tmp_path) == [left] and filming.videos() == []
 
 
 def test_rows_and_videos_depend_on_neither_filming_nor_workers(tmp_path):

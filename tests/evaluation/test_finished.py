@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 from safetensors.numpy import load, save
 
+from surgicai_vision.core.files import FAMILIES, code_version
 from surgicai_vision.evaluation import finished
 from surgicai_vision.evaluation.agents import ZeroAgent
 from surgicai_vision.evaluation.films import Filming, Look
@@ -68,7 +69,9 @@ def test_progress_counts_the_kept_episodes(tmp_path):
     assert seen[-1] == (3 * len(SEEDS), 3 * len(SEEDS))
 
 
-@pytest.mark.parametrize("broken", ["episode", "owner", "other policy", "other code"])
+@pytest.mark.parametrize(
+    "broken", ["episode", "owner", "other policy", "other code", "other families"]
+)
 def test_what_is_damaged_or_of_something_else_runs_again(tmp_path, monkeypatch, broken):
     kept = stop(tmp_path)
     spec = spec_of("grasp", begun := [])
@@ -83,7 +86,11 @@ def test_what_is_damaged_or_of_something_else_runs_again(tmp_path, monkeypatch, 
     elif broken == "other policy":
         spec = replace(spec, about={"checkpoint": {"policy_sha256": "0"}})
     else:
-        monkeypatch.setattr("surgicai_vision.evaluation.run.code_version", lambda: "other")
+        changed = FAMILIES if broken == "other families" else ()
+        monkeypatch.setattr(
+            "surgicai_vision.evaluation.provenance.code_version",
+            lambda *stages: "other" if stages == changed else code_version(*stages),
+        )
     evaluate_into(tmp_path, spec, SEEDS, workers=1)
     assert set(begun) & kept == again
 

@@ -80,6 +80,7 @@ class Saying:
     cameras = ()
     image_size = 224
     privileged = False
+    action_mode = names.INCREMENTS
 
     def __init__(self, classes: list[int], sure: float = 0.9):
         self.said = iter(classes)

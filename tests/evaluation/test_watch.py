@@ -114,6 +114,17 @@ def test_going_on_by_itself_rests_first():
     assert all(distance > 0 for _, points in curves.episodes for distance, _ in points)
 
 
+def test_an_episode_that_was_left_is_not_one_that_has_ended():
+    player = Player(RandomAgent(), SHORT, seed=7, episodes=2)
+    player.handle(Command("next"))
+    player.handle(Command("next"))
+    play_to_the_end(player)
+    assert (player.state, list(player.rows)) == (ENDED, [9])
+    play_to_the_end(player)
+    assert (player.state, list(player.rows)) == (STOPPED, [9, 10])
+    player.close()
+
+
 def test_a_start_that_cannot_be_made_is_an_episode_that_has_ended(monkeypatch):
     def refuse(self, **_):
         raise PhysicsError("No start was physical.")

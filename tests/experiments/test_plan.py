@@ -195,6 +195,8 @@ def test_everything_is_built_once_and_evaluated_on_the_same_starts(quiet, tiny):
         if stored.is_hierarchical:
             ends = "privileged" if stored.condition == "privileged" else "learned"
             assert (stored.termination, stored.env.max_steps) == (ends, 20)
+        assert stored.sees_goal == (stored.condition == "privileged"), "its expert does"
+        assert not state.run.sees_goal, "a key is that of the planned run"
     assert read_experiment_of(out).table() == tiny.table()
 
 
@@ -348,6 +350,20 @@ def test_a_file_is_tried_small_beside_the_whole(tmp_path, monkeypatch, capsys):
         ({"policies": [{**TABLE["policies"][0], "view": ["front"]}]}, "'front'"),
         ({"policies": [{**TABLE["policies"][0], "part": "grsp"}]}, "'grasp'"),
         ({"policies": [TABLE["policies"][0], {**TABLE["policies"][0], "name": "a"}]}, "each once"),
+        (
+            {
+                "demonstrations": [
+                    *TABLE["demonstrations"],
+                    {**TABLE["demonstrations"][1], "name": "shaky", "jaw_noise": 1.0},
+                ],
+                "policies": [
+                    *TABLE["policies"],
+                    {**TABLE["policies"][1], "name": "other", "demonstrations": "shaky"},
+                ],
+                "conditions": [{"name": "standing"}],
+            },
+            "'place' and 'other' have the same run",
+        ),
         ({"encoder": "imagenet-lit"}, "imagenet-lite"),
         ({"polices": []}, "'policies'"),
     ],

@@ -13,7 +13,9 @@ import yaml
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.video import read_video
+from surgicai_vision.experiments.quickstart import run_quickstart
 from surgicai_vision.experiments.quickstart_config import Quickstart
 
 TINY = {
@@ -73,6 +75,12 @@ def run(folder, *arguments):
 def test_a_quickstart_without_policies_is_refused():
     with pytest.raises(InputError, match="policies is empty; give at least one"):
         Quickstart(policies=())
+
+
+def test_images_that_cannot_be_rendered_are_refused_before_any_work(tmp_path):
+    with pytest.raises(InputError, match="size is 2000; it must be within"):
+        run_quickstart(Quickstart(procedure=None, size=2000), tmp_path, RunContext(0), print)
+    assert not list(tmp_path.iterdir())
 
 
 def times(folder):

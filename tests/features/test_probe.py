@@ -11,9 +11,10 @@ from fake_dataset import FakeData
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
 from surgicai_vision.features.cache import Features
-from surgicai_vision.features.probe import FRAMES, _Ridge, _targets, probe, spread
+from surgicai_vision.features.probe import FRAMES, _Ridge, _targets, needle_pose, probe, spread
 from surgicai_vision.scene import rotations
 from surgicai_vision.scene.needle import HOME, TIP_ANGLE, point
 
@@ -39,6 +40,7 @@ class Dataset(FakeData):
     fingerprint: str = "poses"
     views: tuple[str, ...] = ("front", "back")
     image_size: int = 32
+    config: TaskConfig = field(default_factory=TaskConfig)
 
     def __post_init__(self) -> None:
         self.length = len(self.pose)
@@ -152,6 +154,12 @@ def test_what_cannot_be_probed_is_refused() -> None:
     broken.columns = dict  # type: ignore[method-assign]
     with pytest.raises(UnknownName, match="needle_pose"):
         probe(broken, [entry])
+    for axes in ({"needle_arc": "any"}, {"needle_size": 0.1}):
+        varied = TaskConfig(randomisation=RandomisationConfig(**axes))
+        with pytest.raises(InputError, match=f"shape varies in the dataset .{next(iter(axes))}"):
+            probe(Dataset(config=varied), [entry])
+    moved = TaskConfig(randomisation=RandomisationConfig(phantom_shift=5.0))
+    assert len(needle_pose(Dataset(config=moved))) == 120
 
 
 def test_verb_refuses_what_cannot_be_probed_before_it_encodes(

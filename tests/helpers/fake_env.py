@@ -27,6 +27,23 @@ class FakeCalibration:
         return np.eye(4)
 
 
+class FakeTaskState:
+    """The fake's count of steps, which is part of its state."""
+
+    tip_path = 0.0
+
+    def __init__(self, env):
+        self._env = env
+
+    @property
+    def steps(self):
+        return self._env.state[2]
+
+    @steps.setter
+    def steps(self, steps):
+        self._env.state[2] = steps
+
+
 class FakeEnv:
     def __init__(
         self,
@@ -47,6 +64,7 @@ class FakeEnv:
         self.scene = SimpleNamespace(hash="f" * 64)
         self.model = self.data = None
         self.calibration = FakeCalibration(self)
+        self.simulation = SimpleNamespace(task_state=FakeTaskState(self))
         self.phase = 0
         self.state = np.zeros(4)
 

@@ -248,6 +248,38 @@ def test_two_leaders_move_both_arms(robot):
     assert moved[1][0] == pytest.approx(0.005, abs=3e-4)
 
 
+@pytest.mark.parametrize("stop", ["pause", "reset", "reconnect"])
+def test_what_a_leader_does_while_nothing_is_sent_is_not_made_up_for(robot, stop):
+    one = robot(action="leader")
+    joints = dict.fromkeys(one.action_features, 0.0)
+    command = one.served.publisher(topics.psm_topics("PSM2", heard=True)["state_command"])
+
+    def turn(degrees):
+        one.send_action({**joints, "shoulder_pan.pos": degrees})
+
+    turn(0.0)
+    turn(20.0)  # more than one step: the rest waits
+    if stop == "pause":
+        command(StringStamped(Header(), "pause"))
+        for degrees in (30.0, 40.0, 50.0):
+            turn(degrees)
+        command(StringStamped(Header(), "resume"))
+        one.send_action({})
+    elif stop == "reset":
+        one.send_action({RESET: NEXT})
+    else:
+        one.disconnect()
+        one.connect()
+    one.get_observation()
+    start = in_view(one)
+    for _ in range(20):
+        turn(90.0)
+    assert in_view(one) == pytest.approx(start, abs=1e-4)
+    for _ in range(20):
+        turn(100.0)
+    assert in_view(one)[0] - start[0] == pytest.approx(-0.005, abs=3e-4)
+
+
 def test_absolute_actions_lead_both_arms_to_where_they_say(robot):
     """In steps; the pose that is observed, sent back, holds the arms."""
     one = robot(action="absolute")

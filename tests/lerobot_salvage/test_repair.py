@@ -1,5 +1,6 @@
 """Repair: the longest whole prefix of a broken LeRobot dataset, ours or anyone's."""
 
+import errno
 import json
 import shutil
 import subprocess
@@ -20,8 +21,10 @@ import surgicai_vision.dataset
 from lerobot_salvage import check_dataset, repair_dataset, thrift
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import BadFile, OutputExists
-from surgicai_vision.core.executor import RunContext
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists
+from surgicai_vision.core.executor import RunContext, work_folder
+from surgicai_vision.core.executor.store import LOCK
+from surgicai_vision.core.files import locked
 from surgicai_vision.dataset import codecs, render_demos
 
 CAMERA, DATA = "observation.images.cam", "data/chunk-000/file-000.parquet"
@@ -175,8 +178,15 @@ def torn(folder):
     path.write_bytes(path.read_bytes()[: start + 3000])
 
 
+def counts_in_words(folder):
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["total_episodes"] = "many"
+    (folder / "meta/info.json").write_text(json.dumps(info))
+
+
 DAMAGE = {
     "more counted": (counts_more, 3, "it counts 8 episodes"),
+    "no number counted": (counts_in_words, 3, "it counts many episodes"),
     "rows missing": (fewer_rows, 3, "rows do not match the episodes"),
     "torn": (torn, 2, "no footer"),
     "image spoilt": (
@@ -254,6 +264,18 @@ def test_nothing_whole_is_one_line_and_changes_nothing(tmp_path, foreign):
         repair_dataset(folder, tmp_path / "full")
 
 
+def test_a_second_repair_is_refused_and_leaves_the_first_ones_work(tmp_path, foreign):
+    folder = shutil.copytree(foreign / "killed", tmp_path / "set")
+    work = work_folder(folder)
+    work.mkdir()
+    (work / "half").write_text("of the first")
+    with locked(work / LOCK), pytest.raises(InputError, match="Another run is working"):
+        repair_dataset(folder)
+    assert (work / "half").read_text() == "of the first"
+    assert repair_dataset(folder).episodes == 3, "the first one was killed"
+    assert not work.exists()
+
+
 @pytest.fixture
 def ours(tmp_path, monkeypatch):
     render_with_fake_env(monkeypatch, CONFIG)
@@ -312,6 +334,25 @@ def test_the_command_line_checks_and_repairs(tmp_path, foreign, capsys):
     for wrong in (["check"], ["mend", str(folder)], ["check", str(tmp_path / "none")]):
         assert main(wrong) == 2
         assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "The disk is full"),
+        (PermissionError(errno.EACCES, "Permission denied", "set.work"), "set.work: Permission"),
+    ],
+    ids=["full", "not allowed"],
+)
+def test_an_error_of_the_disk_is_one_line(tmp_path, foreign, capsys, monkeypatch, error, said):
+    folder = shutil.copytree(foreign / "killed", tmp_path / "set")
+
+    def refuse(*_):
+        raise error
+
+    monkeypatch.setattr("lerobot_salvage.repair.write_metadata", refuse)
+    assert main(["repair", str(folder)]) == 1
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"lerobot-salvage: error: {said}")
 
 
 def test_the_command_is_installed():

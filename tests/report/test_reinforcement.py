@@ -1,36 +1,42 @@
 """Algorithms in the report: rliable's aggregates, a table next to the paper's, learning curves."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu, trim_mean
-from sweep_results import CHECKPOINT, evaluation
+from sweep_results import CHECKPOINT, episode, evaluation
 from test_report import assert_stands_alone, painted_stage
 
 from surgicai_vision import report
-from surgicai_vision.core import files
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core import files, names
+from surgicai_vision.core.config import SceneConfig, TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation import statistics
+from surgicai_vision.evaluation.storage import write_evaluation
 from surgicai_vision.report.aggregates import (
     bootstrap,
     interquartile_mean,
     probability_of_improvement,
 )
-from surgicai_vision.report.charts import COLOURS
+from surgicai_vision.report.charts import COLOURS, Point, Series
+from surgicai_vision.report.curves import MOST
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.reader import collect
 from surgicai_vision.report.reinforcement import (
     CurvePoint,
+    _chart,
     _points,
     first_at,
     learned,
+    markdown,
     read_curve,
     table,
 )
-from surgicai_vision.training.run_config import RunConfig
+from surgicai_vision.report.sections import ceilings
+from surgicai_vision.training.run_config import RunConfig, Starts, evaluated_in
 
 RATES = {"td3": 0.1, "td3-her-bc": 0.9, "bc": 0.6}
 
@@ -174,6 +180,59 @@ def test_an_algorithm_has_one_colour_and_what_all_share_is_said_once(folder):
     assert learned(cloned).rows[0][0] == "td3-her-bc"
     assert learned(cloned).shared == ("100 demonstrations",)
     assert learned(groups).shared == ()
+
+
+def test_other_worlds_starts_and_budgets_are_rows_of_their_own(tmp_path):
+    generator = np.random.default_rng(0)
+    plain = run_of("td3-her-bc", "grasp", 0)
+    soft = replace(plain, env=TaskConfig("grasp", SceneConfig(tissue="soft")))
+    runs = {
+        "": plain,
+        "in tissue soft": soft,
+        "demonstrated in tissue soft": evaluated_in(soft, TaskConfig("grasp")),
+        "moved": replace(plain, condition="moved"),
+    }
+    for name, run in runs.items():
+        evaluation(tmp_path / "worlds" / (name or "plain"), run, 0.5, generator)
+    rows = {row[0]: row[1] for row in learned(group(collect(tmp_path / "worlds"))).rows}
+    assert rows.keys() == {", ".join(filter(None, ("td3-her-bc", name))) for name in runs}
+    assert {name for name, cell in rows.items() if "paper" in cell} == {
+        "td3-her-bc",
+        "td3-her-bc, moved",
+    }
+    for steps in (2000, 9000):
+        run = replace(plain, env_steps=steps, seed=steps)
+        evaluation(tmp_path / "budgets" / str(steps), run, 0.5, generator)
+    rows = learned(group(collect(tmp_path / "budgets"))).rows
+    assert {row[0] for row in rows} == {
+        "td3-her-bc, 2,000 control steps",
+        "td3-her-bc, 9,000 control steps",
+    }
+
+
+def test_validation_starts_are_not_called_held_out(tmp_path):
+    cloned = RunConfig(TaskConfig("grasp"), privileged=True, demonstrations=100)
+    for name, run in (("actor", run_of("td3-her-bc", "grasp", 0)), ("cloned", cloned)):
+        made = [
+            episode("grasp", name, names.VALIDATION_SEED + index, True, np.random.default_rng(0))
+            for index in range(4)
+        ]
+        starts = Starts(names.VALIDATION_SEED, 4)
+        write_evaluation(tmp_path / name, made, replace(run, starts=starts), {})
+    groups = group(collect(tmp_path))
+    found = learned(groups)
+    assert "paper" not in found.rows[0][1]
+    assert markdown(found).startswith("Success from validation starts")
+    assert "ours" not in ceilings(groups)
+
+
+def test_a_curve_that_only_a_later_algorithm_has_is_in_the_table():
+    drawn = [Series(f"line {index}", ()) for index in range(MOST)]
+    points = tuple(Point(x, 0.5, 0.4, 0.6, "1/2") for x in (1.0, 2.0))
+    curve = [CurvePoint(1000, 500, 1.0, 1, 2)]
+    chart = _chart("t", [*drawn, Series("last", points)], "x", lambda point: 1.0, {"last": [curve]})
+    assert (chart.drawing, chart.more) == ("", "1 more in the table.")
+    assert [row[0] for row in chart.rows] == ["last"]
 
 
 def test_the_page_and_its_tables_have_them(folder, monkeypatch):

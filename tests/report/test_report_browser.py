@@ -77,8 +77,9 @@ SCRIPT = """
   task.dispatchEvent(new Event("input")); words.dispatchEvent(new Event("input"));
   const heads = all("#success th button"),
     click = name => heads.find(b => b.textContent.startsWith(name)).click();
-  const values = n => all("#success tbody tr").map(row => row.cells[n].dataset.v);
+  const values = n => all("#success tbody tr").map(row => row.cells[n]?.dataset.v ?? "");
   click("success"); say.down = values(3); click("success"); say.up = values(3);
+  click("time"); say.steps = values(7);
   click("task"); say.tasks = column(0);
   const row = all("#success tbody tr").find(r => r.textContent.includes("1 training seed failed"));
   row.click();
@@ -127,6 +128,9 @@ def test_a_browser_filters_and_sorts(said, groups):
     assert down == sorted(down, reverse=True)
     assert up == sorted(up)
     assert said["down"][-1] == said["up"][-1] == "", "cells without a result come last either way"
+    steps = [float(value) for value in said["steps"] if value]
+    assert steps == sorted(steps) and len(steps) > 1
+    assert not any(said["steps"][len(steps) :]), "cells that a reason spans come last"
     assert said["tasks"] == sorted(said["tasks"])
 
 

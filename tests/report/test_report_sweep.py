@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from checkpoints import checkpoint
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
@@ -33,7 +34,12 @@ from surgicai_vision import report
 from surgicai_vision.commands.main import main
 from surgicai_vision.commands.report import Options
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig, to_mapping
+from surgicai_vision.core.config import (
+    RandomisationConfig,
+    SceneConfig,
+    TaskConfig,
+    to_mapping,
+)
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.evaluation.storage import FORMAT
@@ -48,13 +54,13 @@ from surgicai_vision.report import (
     paper_comparison,
     tables,
 )
-from surgicai_vision.report.experiment_key import Condition, order
+from surgicai_vision.report.experiment_key import Condition, condition_of, order
 from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import best_trained, group, of_task
 from surgicai_vision.report.pairs import compare, factor
 from surgicai_vision.report.reader import collect
 from surgicai_vision.report.sections import heat_maps
-from surgicai_vision.training.run_config import RunConfig, Shift
+from surgicai_vision.training.run_config import RunConfig, Shift, evaluated_in
 
 LIMIT = 8_000_000
 EXPERT = RunConfig(TaskConfig("grasp"), policy="expert")
@@ -327,6 +333,80 @@ def test_what_the_encoder_gave_is_told_and_stands_not_beside_the_papers_number(t
     (result,) = collect(tmp_path).results
     assert result.condition.pool == "spatial" and "spatial" in result.condition.label
     assert paper_comparison.paper_rate(result.condition) is None
+
+
+def test_training_seeds_under_other_rules_are_another_condition(tmp_path):
+    plain = run_of("grasp", "imagenet", ("back",), 0)
+    eased = TaskConfig("grasp", tolerance="released", max_steps=400)
+    other = replace(plain, env=eased, seed=1)
+    for name, run in (("plain", plain), ("other", other)):
+        evaluation(tmp_path / name, run, 0.5, np.random.default_rng(0))
+    first, second = group(collect(tmp_path))
+    assert (first.label, first.episodes) == ("imagenet on back", 20)
+    rules = "tolerance released, max_steps 400"
+    assert (second.label, second.episodes) == (f"imagenet · with {rules} on back", 20)
+    assert paper_comparison.paper_rate(first.condition) == 0.10
+    assert paper_comparison.paper_rate(second.condition) is None
+    assert factor(first.condition, second.condition) == "rules"
+    limits = TaskConfig("suture", max_steps=20, advance="told")
+    assert not condition_of(RunConfig(limits, termination="learned", parts="a")).rules, "its own"
+
+
+def test_training_seeds_of_other_demonstrations_or_budgets_are_another_condition(tmp_path):
+    one = run_of("grasp", "imagenet", ("back",), 0, demonstrator="expert", noise=0.5, updates=2000)
+    runs = {
+        "noise 0.5, 2,000 updates": one,
+        "noise 0, 2,000 updates": replace(one, seed=1, noise=0.0),
+        "noise 0.5, 500 updates": replace(one, seed=2, updates=500),
+    }
+    for name, run in runs.items():
+        evaluation(tmp_path / name, run, 0.5, np.random.default_rng(0))
+    groups = group(collect(tmp_path))
+    assert {item.label for item in groups} == {f"imagenet on back, {name}" for name in runs}
+    assert all(item.episodes == 20 for item in groups)
+    assert sorted(pair.factor for pair in compare(groups)) == []  # no training seed in common
+    named = {item.details: item.condition for item in groups}
+    first, calm, short = (named[name] for name in runs)
+    assert factor(first, calm) == "noise of the demonstrations"
+    assert factor(first, short) == "budget"
+    assert factor(calm, short) == ""
+    measured = RunConfig(TaskConfig("suture"), algo="ppo", updates=100, env_steps=7123)
+    assert condition_of(measured).budget == "100 updates", "control steps differ between seeds"
+
+
+def test_a_command_repeats_only_what_it_says(tmp_path):
+    generator = np.random.default_rng(0)
+    folder = checkpoint(tmp_path / "policy", "grasp")
+    plain = RunConfig(TaskConfig("grasp"), demonstrations=1)
+    moved = RandomisationConfig(phantom_shift=3.0)
+    runs = {
+        "plain": plain,
+        "moved": evaluated_in(plain, TaskConfig("grasp", randomisation=moved)),
+        "short": replace(plain, env=TaskConfig("grasp", max_steps=50)),
+        "acting": replace(plain, acted_by=("execute=5",)),
+        "expert": EXPERT,
+        "soft": replace(EXPERT, env=TaskConfig("grasp", SceneConfig(tissue="soft"))),
+    }
+    for name, run in runs.items():
+        about = {"folder": folder} if run.is_trained else {}
+        evaluation(tmp_path / "out" / name, run, 0.5, generator, about)
+    starts = "--task grasp --episodes 20 --seed 900000 --json"
+    assert {
+        result.folder.name: tables.evaluate_command(result)
+        for result in collect(tmp_path / "out").results
+    } == {
+        **dict.fromkeys(runs),
+        "plain": f"surgicai-vision evaluate {folder} {starts}",
+        "expert": f"surgicai-vision evaluate expert {starts}",
+    }
+
+
+def test_the_table_of_cells_counts_rows(tmp_path):
+    evaluation(tmp_path, EXPERT, 1.5, np.random.default_rng(0))
+    (item,) = group(collect(tmp_path))
+    item.results[0].summary["successes"] = 3
+    (cell,) = tables.cell_records([item])
+    assert (cell["successes"], cell["rate"]) == (20, 1.0)
 
 
 def test_results_of_another_version_are_refused_in_one_line(tmp_path, root, capsys):

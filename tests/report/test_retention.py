@@ -1,5 +1,6 @@
 """Retention in the report: bars per axis, the worst axis, held-in against held-out looks."""
 
+import itertools
 import re
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation import statistics
+from surgicai_vision.report.curves import robustness_curves
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.reader import collect
 from surgicai_vision.report.retention import looks, retentions
@@ -66,6 +68,33 @@ def test_held_out_looks_stand_beside_those_for_training(folder):
     first, second = (int(words.split("/")[0]) for words in (held_in, held_out))
     assert first > second
     assert kept.startswith(f"{100 * second / first:.0f} %")
+
+
+def test_policies_that_differ_in_their_demonstrations_are_told_apart(tmp_path):
+    generator = np.random.default_rng(5)
+    about = {"checkpoint": CHECKPOINT}
+    for count, at_full in ((50, -0.5), (350, 1.5)):
+        for axis, strength in itertools.product(("light", "blur"), (0.0, 1.0)):
+            shift = Shift(axis, strength)
+            run = run_of("grasp", "imagenet", ("back",), 0, demonstrations=count, shift=shift)
+            rate = at_full if strength else 1.5
+            evaluation(tmp_path / f"{count}-{axis}-{strength}", run, rate, generator, about)
+        shown = {
+            look: TaskConfig("grasp", randomisation=RandomisationConfig(appearance=look))
+            for look in (names.TRAIN, names.HELDOUT)
+        }
+        trained = run_of("grasp", "imagenet", ("back",), 0, demonstrations=count)
+        trained = replace(trained, env=shown[names.TRAIN])
+        for look, env in shown.items():
+            run = evaluated_in(trained, env)
+            evaluation(tmp_path / f"{count}-{look}", run, 0.5, generator, about)
+    groups = group(collect(tmp_path))
+    policies = [f"imagenet on back, {count} demonstrations" for count in (50, 350)]
+    assert [chart.title for chart in retentions(groups)] == [f"grasp: {name}" for name in policies]
+    for chart in robustness_curves(groups):
+        areas = {row[0]: row[-1].split(" ")[0] for row in chart.rows}
+        assert areas == dict(zip(policies, ("0.50", "1.00"), strict=True))
+    assert [row[1] for row in looks(groups)] == policies
 
 
 def test_the_page_shows_both_and_stands_alone(folder, monkeypatch):

@@ -55,6 +55,29 @@ def test_minari_recovers_the_env_and_its_episodes(demos, tmp_path, monkeypatch, 
     env.close()
 
 
+@pytest.mark.parametrize("format", export.FORMATS)
+def test_an_export_may_be_repeated_also_where_it_was_killed(demos, tmp_path, monkeypatch, format):
+    monkeypatch.setitem(os.environ, "MINARI_DATASETS_PATH", "")
+    given = ["--demos", str(demos["grasp"]), "--format", format, "--out", str(tmp_path / "out")]
+    found = []
+    for _ in range(2):
+        assert main(["export-demos", "--episodes", "1", *given]) == 0
+        (tmp_path / "out" / export.CARD).unlink()  # written last
+        found.append(sorted(str(path) for path in tmp_path.rglob("*")))
+    assert found[0] == found[1]
+    (tmp_path / "out" / "mine").touch()
+    assert main(["export-demos", *given]) == 2
+
+
+def test_an_export_is_named_by_the_task_of_its_demonstrations(demos, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    given = ["export-demos", "--episodes", "1", "--demos", str(demos["insert"])]
+    assert main(given) == 0
+    assert [path.name for path in tmp_path.glob("outputs/transitions/*")] == ["insert-relative-npz"]
+    assert main([*given, "--task", "grasp"]) == 2
+    assert "shows insert; leave --task out" in capsys.readouterr().err
+
+
 @pytest.fixture(scope="module", params=["goal", "relative"])
 def exported(request, demos, tmp_path_factory) -> tuple[Path, Transitions]:
     out = tmp_path_factory.mktemp("robomimic") / request.param

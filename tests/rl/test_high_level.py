@@ -8,6 +8,7 @@ import pytest
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists
+from surgicai_vision.evaluation.agent import Agent, frame_of
 from surgicai_vision.evaluation.agents import BASELINES
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy
@@ -62,6 +63,38 @@ def test_an_episode_has_so_many_decisions():
     ends = [env.step(np.int64(subtask))[2:4] for subtask in (0, 1)]
     assert ends == [(False, False), (False, True)]
     env.close()
+
+
+class Looking(Agent):
+    """Holds still and looks at its own camera."""
+
+    def __init__(self, camera, image_size=16, action_mode=names.INCREMENTS):
+        self.cameras, self.image_size, self.action_mode = (camera,), image_size, action_mode
+
+    def reset(self, slot, robot, seed):
+        pass
+
+    def act(self, slots, robots, observations):
+        assert frame_of(observations[0], self.cameras[0]).shape == (16, 16, 3)
+        return np.zeros((1, 7), np.float32)
+
+
+def test_every_low_level_policy_sees_its_own_camera():
+    short = dataclasses.replace(EXPERTS, steps=2)
+    task = TaskConfig(names.SUTURE, max_steps=2000)
+    zero = BASELINES["zero"]
+    env = DecisionEnv(short, task, [zero(), Looking("front"), Looking("back_psm1"), zero(), zero()])
+    env.reset(seed=0)
+    for subtask in range(3):
+        env.step(np.int64(subtask))
+    assert env.control_steps == 6
+    env.close()
+    for other, said in (
+        (Looking("back", image_size=32), "one image size"),
+        (Looking("back", action_mode="absolute"), "set-points of both arms"),
+    ):
+        with pytest.raises(InputError, match=said):
+            DecisionEnv(short, task, [zero(), Looking("front"), other, zero(), zero()])
 
 
 def request_of(**changes):

@@ -8,8 +8,10 @@ import pytest
 import torch
 from helpers.checkpoints import checkpoint
 
+from policies.bc import BC
 from policies.residual import Residual, ResidualRecipe
 from surgicai_vision.core import names
+from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.rollout import run_share
@@ -18,6 +20,7 @@ from surgicai_vision.rl.learner import linear
 from surgicai_vision.rl.residual import CorrectionEnv, train_residual
 from surgicai_vision.rl.residual_config import ResidualRequest, residual_settings
 from surgicai_vision.rl.settings import Settings
+from surgicai_vision.training.checkpoint import read_checkpoint, write_checkpoint
 from surgicai_vision.training.policies import load_policy
 
 STILL = np.zeros(7, np.float32)
@@ -161,6 +164,14 @@ def test_only_a_cloned_policy_of_one_subtask_is_corrected(base, tmp_path):
     for other in (tmp_path / "residual", "expert"):
         with pytest.raises(InputError, match="can be corrected"):
             train_residual(request_of(str(other)), tmp_path / "again")
+    progress = read_checkpoint(checkpoint(tmp_path / "fed" / "progress", "suture", "hlp"))
+    recipe = BC.recipe(progress_input=True)  # as a recipe file says it, without a change
+    fed = dataclasses.replace(
+        read_checkpoint(base), recipe=to_mapping(recipe), progress_sha256=progress.policy_sha256
+    )
+    write_checkpoint(tmp_path / "fed", fed, BC.make(recipe, ()).state_dict())
+    with pytest.raises(InputError, match="uses another policy's progress"):
+        train_residual(request_of(str(tmp_path / "fed")), tmp_path / "again")
     with pytest.raises(InputError, match="success_steps"):
         ResidualRequest(base, settings=residual_settings({"success_steps": 3}))
     with pytest.raises(InputError, match="stop_at"):

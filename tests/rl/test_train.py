@@ -34,25 +34,25 @@ def request_of(algo, demos, task="grasp", **changes):
     algorithm = ALGORITHMS[algo]
     paths = list_demos(demos[task]) if algorithm.needs_demos else []
     small = SMALL | ({"rollout": 24} if algo == "ppo" else {})
+    steps, save_every = 48, 24
     if "learning_starts" in algorithm.settings:
         small["learning_starts"] = LIMIT + 2
+    if algorithm.needs_demos and algorithm.has_hindsight:
+        # an episode must end before hindsight looks back at it
+        small["learning_starts"], steps, save_every = 205, 212, 206
     # Demonstrations are longer than `LIMIT` allows, so their env keeps its own limit.
     env = TaskConfig(task) if algorithm.needs_demos else TaskConfig(task, max_steps=LIMIT)
     request = Request(
         algo=algo,
         env=env,
         settings=settings_of(algo, small),
-        env_steps=48 if algorithm.is_online else 0,
+        env_steps=steps if algorithm.is_online else 0,
         updates=0 if algorithm.is_online else 12,
         demonstrations=len(paths),
         demos=demos_digest(paths) if paths else "",
         validation=0,
-        save_every=24 if algorithm.is_online else 6,
+        save_every=save_every if algorithm.is_online else 6,
     )
-    if algorithm.is_online and algorithm.needs_demos and algorithm.has_hindsight:
-        # an episode must end before hindsight looks back at it
-        settings = replace(request.settings, learning_starts=205)
-        request = replace(request, settings=settings, env_steps=212, save_every=206)
     return replace(request, **changes), paths
 
 
@@ -263,6 +263,12 @@ def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, caps
     assert "give observation relative" in refused("td3-her", "--observation", "state")
     assert "imitation" in refused("sac", "--view", "front")
     assert "several" in refused("td3-her", "--task", "suture")
+    assert "at least 201, or 0" in refused("td3-her", "--change", "learning_starts=200")
+    shown = ("--demos", str(demos["grasp"]))
+    for algo, share, rows in (("td3-bc", 0.001, 0), ("rlpd", 0.999, 256)):
+        assert f"{rows} of the 256" in refused(algo, *shown, "--change", f"demo_share={share}")
+    for algo, unread in (("bc", "tau=0.1"), ("awac", "samples=4"), ("iql", "samples=4")):
+        assert f"setting of '{algo}'" in refused(algo, *shown, "--change", unread)
     with pytest.raises(UnknownName, match="td3"):
         settings_of("td4", {})
     with pytest.raises(InputError, match="gamma is 1"):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from memory_transport import MemoryTransport
 from stepped_server import SEED, Served, env_of
+from told_clock import Clock
 
 from surgicai_vision import envs
 from surgicai_vision.core import names
@@ -36,6 +37,7 @@ from surgicai_vision.robot.guards import (
     Input,
     Planned,
     TargetGuard,
+    problem_of_dead_man,
     problem_of_inputs,
 )
 from surgicai_vision.robot.messages import Header, Joy, PoseStamped, StringStamped
@@ -312,12 +314,21 @@ def test_a_dry_run_tells_and_moves_nothing():
 
 
 def test_nothing_is_sent_while_the_switch_is_not_held():
-    ages = iter([0.0, 0.1, 9.9, 9.9, 0.0])
+    ages = iter([0.0, 0.0, 0.1, 0.1, 9.9, 9.9, 0.0, 0.0])
     script = Script([(-1, [1, 0, 0, 0, 0, 0, 0])] * 5)
     episode, lines, told, _ = drive(script, "grasp", 5, dead_man=lambda: next(ages))
     assert [line["sent"] for line in lines] == [True, True, False, False, True]
     assert episode.held == 2
     assert "held: the dead-man's switch is not held" in told
+
+
+def test_a_switch_released_while_the_policy_decides_holds_the_arm():
+    ages = iter([0.0, 0.0, 0.1, 0.6])
+    script = Script([(-1, [1, 0, 0, 0, 0, 0, 0])] * 2)
+    served = Served("grasp")
+    _, lines, _, _ = drive(script, "grasp", 2, dead_man=lambda: next(ages), transport=served)
+    assert [line["sent"] for line in lines] == [True, False]
+    assert lines[1]["action"] == [1, 0, 0, 0, 0, 0, 0]
 
 
 def test_a_pedal_counts_only_while_it_is_sent_anew():
@@ -329,6 +340,27 @@ def test_a_pedal_counts_only_while_it_is_sent_anew():
     assert pedal.age() < 0.5
     say(Joy(Header(), (), (0,)))
     assert pedal.age() == math.inf
+
+
+def test_an_old_press_is_as_old_as_the_last_reading(monkeypatch):
+    """What waits to be read may have come at any time since then."""
+    clock = Clock()
+    monkeypatch.setattr("surgicai_vision.robot.dead_man.time.monotonic", clock)
+    transport = MemoryTransport()
+    say = transport.publisher(topics.Topic("/pedal", Joy))
+    pedal = HeldPedal(transport, "/pedal")
+    master, slave = pty.openpty()
+    with os.fdopen(slave) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        with HeldKey() as key:
+            ages = []
+            for pause in (0.0, 0.02, 9.0, 0.02):
+                say(Joy(Header(), (), (1,)))
+                os.write(master, b" ")
+                clock.now += pause
+                ages.append((key.age(), pedal.age()))
+    os.close(master)
+    assert ages == [(pytest.approx(age),) * 2 for age in (math.inf, 0.02, 9.0, 0.02)]
 
 
 def test_the_space_bar_of_a_terminal_is_a_switch(monkeypatch):
@@ -455,7 +487,7 @@ def planned(shift=0.0, lead=0.0):
     ],
 )
 def test_what_holds_a_policy_back(inputs, states, dead_man, problem):
-    said = problem_of_inputs(inputs, states, dead_man)
+    said = problem_of_dead_man(dead_man) or problem_of_inputs(inputs, states)
     assert problem in said
     assert bool(said) == bool(problem)
 

@@ -381,6 +381,34 @@ def test_a_driven_arm_that_is_stopped_is_still_and_told_nothing(monkeypatch, act
         assert again.held == 0
 
 
+def test_a_diverged_episode_says_so_and_the_next_one_is_driven():
+    served = Served("grasp")
+    client = Client(served, ClientConfig(is_simulated=True))
+    client.connect()
+    robot = DrivenRobot(client, (), "grasp", 64)
+    config = DriveConfig(GuardConfig(), sends=True, is_simulated=True, is_stepped=True)
+
+    def diverge():
+        served.robot.env.data.ctrl[:] = math.nan
+
+    def stop():
+        diverge()
+        client.step([], client.stamp())
+        state_command("fault")(served)
+
+    def driver(act):
+        agent = Interrupted(act)
+        return Driver(agent, robot, TaskConfig("grasp"), config, float, io.StringIO(), print)
+
+    diverging = driver(diverge)
+    assert diverging.episode(SEED, 20).ended == "the physics diverged"
+    again = diverging.episode(SEED + 1, 20)
+    assert (again.steps, again.held) == (20, 0)
+    # A person's stop outlasts the reset.
+    driver(stop).episode(SEED, 20)
+    assert diverging.episode(SEED + 1, 20).ended == "PSM2 is FAULT: the robot was stopped"
+
+
 def test_a_lag_is_what_is_later_than_usual_whatever_the_senders_clock():
     lag = _Lag()
     offset = 12345.0

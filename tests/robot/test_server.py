@@ -10,6 +10,7 @@ import pytest
 from memory_transport import MemoryTransport
 
 from surgicai_vision import envs
+from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError
@@ -220,6 +221,27 @@ def test_a_reset_begins_the_episode_of_its_seed_again():
     client.say("/simulation/reset", StringStamped(Header(8), "-1"))
     client.server.poll()
     assert "must be a seed" in client.take()["/simulation/stepped"][0].text
+
+
+def test_the_seconds_of_a_served_simulation_go_on_over_resets(monkeypatch, capsys):
+    class Asking(MemoryTransport):
+        """Asks for a step whenever the server waits, and for a reset every third time."""
+
+        waits = 0
+
+        def wait(self, seconds):
+            self.waits += 1
+            assert self.waits < 20, "it never ends"
+            self.publisher(topics.STEP)(StringStamped(Header(), ""))
+            if self.waits % 3 == 0:
+                self.publisher(topics.RESET)(StringStamped(Header(), str(SEED)))
+
+    monkeypatch.setattr("surgicai_vision.robot.transport.open_transport", lambda *_: Asking())
+    options = ("--task", "grasp", "--clock", "stepped", "--seconds", "0.14", "--json")
+    assert main(["robot", "serve", *options]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("7 control steps")
+    assert json.loads(said[-1])["steps"] == 7
 
 
 def test_what_was_sent_before_a_reset_is_not_obeyed_after_it():

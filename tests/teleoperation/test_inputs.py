@@ -78,6 +78,9 @@ def test_a_gamepad_button_counts_once_a_press():
     assert pad.poll().events == (JAW, KEEP)
     pad.release_all()
     pad.update([], [1.0])
+    assert pad.poll().events == (), "it was down all the time"
+    pad.update([], [])
+    pad.update([], [1.0])
     assert pad.poll().events == (JAW,)
 
 

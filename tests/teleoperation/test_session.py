@@ -14,8 +14,10 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.core.files import write_json
 from surgicai_vision.core.pacer import Pacer
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_marker
+from surgicai_vision.teleoperation import recordings
 from surgicai_vision.teleoperation.inputs import DISCARD, KEEP, START, STOP, VIEW, Input
 from surgicai_vision.teleoperation.keyboard import TABLE, key_names, key_table
 from surgicai_vision.teleoperation.loop import run_session
@@ -206,6 +208,41 @@ def test_an_episode_whose_entry_a_kill_prevented_counts(open_session, tmp_path):
     keep_one(session)
     assert len(list_demos(tmp_path / "demos")) == 3
     assert not list((tmp_path / "demos").glob(".partial*"))
+
+
+@pytest.mark.parametrize("episode", [None, "episode_000000.safetensors"])
+def test_a_kill_around_the_first_episode_loses_no_folder(
+    open_session, tmp_path, monkeypatch, episode
+):
+    """Killed while the first kept episode was written, or before it was entered."""
+    session = open_session()
+    folder = tmp_path / "demos"
+    write_demo = recordings.write_demo
+
+    def killed(folder, index, demo):
+        (folder / ".partial-1-episode_000000.safetensors").write_bytes(b"half")
+        if episode:
+            write_demo(folder, index, demo)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recordings, "write_demo", killed)
+    with pytest.raises(KeyboardInterrupt):
+        keep_one(session)
+    monkeypatch.undo()
+    session = open_session()
+    kept = 1 if episode else 0
+    assert (session.status().seed, session.status().episode) == (kept, kept)
+    keep_one(session)
+    assert len(list_demos(folder)) == kept + 1
+    assert not list(folder.glob(".partial*"))
+
+
+def test_a_folder_from_before_the_config_gained_a_field_goes_on(open_session, tmp_path):
+    keep_one(open_session())
+    marker = read_marker(tmp_path / "demos")
+    del marker["request"]["task"]["scene"]["ink"]
+    write_json(tmp_path / "demos" / "demos.json", marker)
+    assert open_session().status().episode == 1
 
 
 def test_a_folder_is_one_sessions_at_a_time(open_session, tmp_path):

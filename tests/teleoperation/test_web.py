@@ -74,6 +74,17 @@ def test_keys_arrive_once_and_stay_while_they_are_heard_of():
     assert inputs.poll() == REST
 
 
+def test_a_gamepad_that_is_heard_again_presses_nothing_anew():
+    inputs = PageInputs(clock := Clock())
+    held = {"axes": [1, 0, 0, 0], "buttons": [0] * 9 + [1]}
+    inputs.receive(page_message(0, **held))
+    assert inputs.poll() == Input((1, 0, 0), events=(START,))
+    clock.now += 1.1 * SILENCE_S
+    assert inputs.poll() == REST
+    inputs.receive(page_message(1, **held))
+    assert inputs.poll() == Input((1, 0, 0))
+
+
 def test_a_tap_between_two_messages_counts():
     inputs = PageInputs(Clock())
     inputs.receive(page_message(0, pressed=["KeyE", "Space", "Space"]))

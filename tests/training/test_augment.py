@@ -55,6 +55,15 @@ def test_a_moved_map_is_the_map_elsewhere() -> None:
     assert len(moves) > 15 and max(max(move) for move in moves) == 2
 
 
+def test_a_map_may_be_moved_out_of_its_own_sight() -> None:
+    torch.manual_seed(4)
+    observed = torch.ones(200, 2 * 9 + 7)
+    moved = with_shift(observed, ((2, 3, 3),), 8)
+    assert (moved[:, 18:] == 1).all(), "the vector was moved"
+    left = moved[:, :18].sum(1)
+    assert (left == 0).any() and (left > 0).any() and (left <= 18).all()
+
+
 def test_views_move_together_where_they_are_joined_only() -> None:
     torch.manual_seed(2)
     observed = torch.ones(200, 2 * 16)

@@ -31,8 +31,10 @@ from surgicai_vision.report.experiment_key import condition_of
 from surgicai_vision.report.pairs import factor
 from surgicai_vision.training.averages import MovingAverage
 from surgicai_vision.training.chunks import earlier_rows, timeline_of, with_chunks
+from surgicai_vision.training.loop import Training
 from surgicai_vision.training.policies import POLICIES, load_policy, load_recipe
-from surgicai_vision.training.run_config import of_training
+from surgicai_vision.training.request import TrainingRequest
+from surgicai_vision.training.run_config import RunConfig, of_training
 from surgicai_vision.training.train import epochs_within, train
 
 QUICK = ChunkRecipe(epochs=8, batch_size=32, learning_rate=1e-2, chunk=4, execute=2, history=2)
@@ -139,9 +141,41 @@ def test_a_dataset_of_few_frames_has_its_actions_in_its_demonstrations(tmp_path:
         timeline_of(few, tmp_path / "nowhere")
 
 
+def test_a_dataset_of_held_actions_has_each_of_them_once(tmp_path: Path) -> None:
+    held = TaskConfig("grasp", action_repeat=2)
+    context = RunContext(0)
+    record(held, episodes=2, out=tmp_path / "demos", context=context)
+    render_demos(
+        tmp_path / "demos",
+        tmp_path / "set",
+        views=("back",),
+        size=16,
+        frame_stride=5,
+        context=context,
+    )
+    dataset = open_dataset(tmp_path / "set")
+    timeline = timeline_of(dataset)
+    actions = dataset.columns()[names.ACTION]
+    np.testing.assert_array_equal(timeline.action[timeline.step], actions)
+
+
 def test_earlier_rows_stay_within_their_episode() -> None:
     dataset = with_frame_stride(recorded(2, 11), 5)
-    assert earlier_rows(dataset, 2).tolist() == [[0, 0], [0, 1], [1, 2], [3, 3], [3, 4], [4, 5]]
+    rows = earlier_rows(dataset, 2, 5)
+    assert rows.tolist() == [[0, 0], [0, 1], [1, 2], [3, 3], [3, 4], [4, 5]]
+
+
+@pytest.mark.parametrize("stride", [9, 60])
+def test_a_history_is_of_earlier_frames_at_every_stride(
+    stride: int, tmp_path: Path, registered: None
+) -> None:
+    whole = recorded(5, 3 * stride)
+    dataset = with_chunks(with_frame_stride(whole, stride), timeline_of(whole), range(4))
+    recipe = replace(QUICK, frame_stride=stride)
+    request = TrainingRequest(dataset, (), LINEAR, recipe, 0, RunConfig())
+    training = Training(request, None, torch.device("cpu"))
+    assert training.seen is not None
+    assert training.seen[:6].tolist() == [[0, 0], [0, 1], [1, 2], [3, 3], [3, 4], [4, 5]]
 
 
 def test_a_chunk_policy_trains_and_reads_back(tmp_path: Path, registered: None) -> None:
@@ -251,7 +285,7 @@ def test_the_average_is_the_weighted_sum_of_all_weights() -> None:
     assert layer.weight.item() == 3.0
 
 
-def acting(recipe: ChunkRecipe) -> tuple[ChunkAgent, list[float]]:
+def acting(recipe: ChunkRecipe, action_repeat: int = 1) -> tuple[ChunkAgent, list[float]]:
     """Return an agent of a policy without images, and the seeds it plans with."""
     policy = Linear(recipe, ())
     seeds: list[float] = []
@@ -263,7 +297,8 @@ def acting(recipe: ChunkRecipe) -> tuple[ChunkAgent, list[float]]:
         return (start[-1] * 100 + start[0] * 10 + steps * np.ones((1, 1, 7))).astype(np.float32)
 
     policy.plan = plan  # type: ignore[method-assign,assignment]
-    return ChunkAgent(policy, PolicyAgent("linear", policy, None, (), 32)), seeds
+    senses = PolicyAgent("linear", policy, None, (), 32, action_repeat=action_repeat)
+    return ChunkAgent(policy, senses), seeds
 
 
 class Brightness:
@@ -295,6 +330,12 @@ def test_the_beginning_of_a_chunk_is_executed_and_then_planned_anew() -> None:
     agent.reset(0, None, 7)
     moved(agent, 7)
     assert seeds[:3] == seeds[-3:]
+
+
+def test_actions_that_are_held_are_fewer_than_control_steps() -> None:
+    agent, _ = acting(replace(QUICK, execute=3, frame_stride=4), action_repeat=2)
+    agent.reset(0, None, 7)
+    assert moved(agent, 7) == [0, 1, 2, 310, 311, 312, 640], "as with stride 2, none held"
 
 
 @pytest.mark.parametrize(

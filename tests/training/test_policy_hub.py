@@ -1,6 +1,7 @@
 """Policies are pushed to and pulled from a Hub that is a folder."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -67,6 +68,20 @@ def test_the_card_tells_data_recipe_seed_scene_successes_and_licence(policy: Pat
     ):
         assert part in body, part
     assert "model-index" not in model_card(trained, REPO)
+
+
+@pytest.mark.parametrize(
+    ("algo", "learning"),
+    [(None, "imitation"), ("bc", "imitation"), ("td3-her-bc", "reinforcement")],
+)
+def test_the_card_tells_how_it_was_trained(policy: Path, algo: str | None, learning: str) -> None:
+    trained = read_checkpoint(policy)
+    trained = replace(trained, run=replace(trained.run, algo=algo, env_steps=24))
+    _, header, body = model_card(trained, REPO).split("---\n", 2)
+    assert yaml.safe_load(header)["tags"] == [
+        "surgical-robotics", "suturing", f"{learning}-learning",
+    ]  # fmt: skip
+    assert f"trained by {learning} learning" in body
 
 
 @pytest.mark.parametrize("name", [CARD, WEIGHTS])

@@ -72,6 +72,17 @@ def test_a_policy_of_progress_sees_its_own_views(says: Path, tmp_path: Path) -> 
     np.testing.assert_array_equal(told[:50, 0], expected)
 
 
+def test_a_policy_of_progress_may_see_images_alone(tmp_path: Path) -> None:
+    dataset = fake_procedures(2)
+    seen = [features_of(dataset)]
+    train(dataset, seen, HLP, replace(QUICK, proprioception=False), out=tmp_path / "a")
+    policy = load_policy(tmp_path / "a")
+    told = with_progress(dataset, policy, seen).columns()[names.PROGRESS]
+    rows = dataset.rows[:50].astype(np.float32)
+    expected = policy.act(rows, dataset.columns()[names.STATE][:50])[:, 5]
+    np.testing.assert_array_equal(told[:50, 0], expected)
+
+
 def test_when_it_acts_it_is_fed_the_same(says: Path, fed: Path) -> None:
     columns = fake_procedures(2).columns()
     rows = range(0, 40, 8)

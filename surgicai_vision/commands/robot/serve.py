@@ -138,21 +138,21 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
                 "Ctrl-C ends it"
             )
             try:
-                server.run(lambda: limit is not None and robot.steps >= limit)
+                server.run(lambda: limit is not None and server.steps >= limit)
             except KeyboardInterrupt as interrupt:
                 if isinstance(interrupt, Terminated):
                     raise
             late = 1e3 * np.array(server.lateness or [0.0])
         env.close()
     console.say(
-        f"{robot.steps} control steps; they began late by {np.median(late):.2f} ms (median) and "
+        f"{server.steps} control steps; they began late by {np.median(late):.2f} ms (median) and "
         f"{np.percentile(late, 99):.2f} ms (99th percentile)."
     )
     return {
         "task": options.task,
         "domain": domain,
         "interface": options.interface,
-        "steps": robot.steps,
+        "steps": server.steps,
         "late_ms_median": float(np.median(late)),
         "late_ms_p99": float(np.percentile(late, 99)),
     }

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.files import sha256_file
 from surgicai_vision.core.names import SUTURE
 from surgicai_vision.demos.demonstrator import Demonstrator
 from surgicai_vision.demos.dmp.fit import CARRY_PHASES, CarryPhase, SubtaskFit, as_pose, fit_subtask
@@ -68,7 +69,8 @@ class DmpController(Demonstrator):
                 "Movement primitives are learned for a subtask; the whole procedure has none."
             )
         self.env = env
-        self.fit = _fit_files(env.task, tuple(map(str, demos)), scaled)
+        files = tuple((str(path), sha256_file(Path(path))) for path in demos)
+        self.fit = _fit_files(env.task, files, scaled)
         self._execution: Execution | None = None
         self._index = 0
         self._closing = False
@@ -163,6 +165,6 @@ def _split(pose: Matrix) -> tuple[Matrix, Matrix]:
 
 
 @functools.lru_cache(maxsize=8)
-def _fit_files(task: str, demos: tuple[str, ...], scaled: bool) -> SubtaskFit:
-    """Fit the primitives, once per process."""
-    return fit_subtask(task, [read_demo(Path(path)) for path in demos], scaled)
+def _fit_files(task: str, files: tuple[tuple[str, str], ...], scaled: bool) -> SubtaskFit:
+    """Fit the primitives to files, (path, sha256) each; once per process and content."""
+    return fit_subtask(task, [read_demo(Path(path)) for path, _ in files], scaled)

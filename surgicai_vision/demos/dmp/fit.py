@@ -305,8 +305,13 @@ def _fit_grasping(task: str, demos: list[DemoPoses], scaled: bool) -> SubtaskFit
 
 
 def closing(jaw: Array) -> int:
-    """Return the index from which a commanded jaw (T,) [rad] only closes, to the end."""
-    opens = np.flatnonzero(np.diff(jaw) >= 0.0)
+    """Return the index from which a commanded jaw (T,) [rad] only closes, up to its last motion.
+
+    A demonstration may go on after that: closed jaws then stand still.
+    """
+    moves = np.flatnonzero(np.diff(jaw))
+    moving = jaw[: moves[-1] + 2] if len(moves) else jaw
+    opens = np.flatnonzero(np.diff(moving) >= 0.0)
     return int(opens[-1]) + 1 if len(opens) else 0
 
 

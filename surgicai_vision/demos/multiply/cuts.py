@@ -113,15 +113,20 @@ class Track:
 # -- reading a demonstration -----------------------------------------------------------------------
 
 
-@functools.lru_cache(maxsize=64)
 def read_source(path: str) -> Source:
-    """Read a demonstration and cut it; once per process.
+    """Read a demonstration and cut it; once per process and content of the file.
 
     Raises:
         BadFile: the file is not a demonstration.
         InputError: it was multiplied itself, or was recorded in a scene that is compiled
             differently now.
     """
+    return _read_source(path, sha256_file(Path(path)))
+
+
+@functools.cache
+def _read_source(path: str, sha256: str) -> Source:
+    """Read and cut a demonstration whose file has this hash; see `read_source`."""
     demo = read_demo(Path(path))
     if demo.demonstrator == NAME:
         raise InputError(
@@ -146,7 +151,7 @@ def read_source(path: str) -> Source:
             f"{path} shows '{demo.config.task}', which has no pieces to re-pose; allowed: "
             f"{', '.join(names.TASKS)}."
         )
-    return Source(sha256_file(Path(path)), keeps_time, start, MappingProxyType(segments))
+    return Source(sha256, keeps_time, start, MappingProxyType(segments))
 
 
 def _runs(demo: Demo) -> list[tuple[str, int, int]]:

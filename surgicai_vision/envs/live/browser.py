@@ -49,6 +49,8 @@ PLAY_COMMANDS = MappingProxyType(
     }
 )
 FOLDER = Path(__file__).parent / "page"
+LARGEST = 1000
+"""Limit of the numbers of a command, in any unit."""
 WAITING = 256
 """Most commands that may wait; further ones are dropped."""
 
@@ -197,20 +199,20 @@ def read_command(content: object, allowed: Mapping[str, int], views: Sequence[st
     name = content.get("command")
     numbers = content.get("numbers", [])
     shown = content.get("views", [])
-    if (
-        not isinstance(name, str)
-        or name not in allowed
-        or not isinstance(numbers, list)
-        or len(numbers) != allowed[name]
-        or not all(isinstance(number, (int, float)) for number in numbers)
-        or not all(-1000 < number < 1000 for number in numbers)
-        or not isinstance(shown, list)
-        or not all(isinstance(view, str) and view in views for view in shown)
-        or len(set(shown)) != len(shown)
-        or len(shown) > MAX_VIEWS
-        or (name == "views") != bool(shown)
-    ):
-        raise InputError(f"A command must be one of {', '.join(allowed)}, with its numbers.")
+    if not isinstance(name, str) or name not in allowed:
+        raise InputError(f"A command must be one of {', '.join(allowed)}.")
+    if not isinstance(numbers, list) or len(numbers) != allowed[name]:
+        raise InputError(f"The numbers of '{name}' must be a list of length {allowed[name]}.")
+    for number in numbers:
+        if not isinstance(number, int | float) or not -LARGEST < number < LARGEST:
+            raise InputError(f"A command's numbers must be between -{LARGEST} and {LARGEST}.")
+    if not isinstance(shown, list) or len(shown) > MAX_VIEWS:
+        raise InputError(f"The views must be a list of at most {MAX_VIEWS}.")
+    for view in shown:
+        if view not in views or shown.count(view) > 1:
+            raise InputError(f"The views must be among {', '.join(views)}, each once.")
+    if (name == "views") != bool(shown):
+        raise InputError("The command 'views' must name a view, and no other command may.")
     if name == "speed" and numbers[0] not in SPEEDS:
         raise InputError(f"The speed must be one of {SPEEDS}.")
     if name == "zoom" and not 0.1 <= numbers[0] <= 10:

@@ -168,9 +168,14 @@ def _trained(
 
 
 def evaluate_as(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) -> dict[str, JSON]:
-    """Evaluate `spec` in its env, named and stored as `run`."""
+    """Evaluate `spec` in its env, named and stored as `run`.
+
+    What is stored says if a policy within `spec`, such as an expert, sees the state with the goal.
+    """
     assert run.starts is not None, "the experiment says where a run is evaluated"
     stored = evaluated_in(run, spec.config, run.shift)
+    if spec.run.sees_goal and not stored.sees_goal:
+        stored = dataclasses.replace(stored, privileged=True)
     spec = dataclasses.replace(spec, run=stored, about=about)
     return evaluate_into(folder, spec, run.starts.seeds, workers=1)
 

@@ -29,7 +29,11 @@
 
   // Sort: numbers by their value, the rest as text; what is absent comes last either way.
   const sort = (table, column, direction) => {
-    const body = table.tBodies[0], key = row => row.cells[column].dataset.v ?? row.cells[column].textContent.trim();
+    const body = table.tBodies[0];
+    const key = row => {
+      const cell = row.cells[column]; // missing beside one that spans several columns
+      return cell?.dataset.v ?? cell?.textContent.trim() ?? "";
+    };
     const compare = (a, b) => {
       const [x, y] = [key(a), key(b)];
       const absent = (x === "" || x === "–") - (y === "" || y === "–");
