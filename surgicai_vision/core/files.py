@@ -262,7 +262,10 @@ FAMILIES = ("encoders", "policies")
 """Packages next to this one whose sources decide results."""
 SHARED = tuple(
     PACKAGE / "core" / f"{name}.py"
-    for name in ("cameras", "config", "corruption", "names", "runs", "tasks", "variants", "video")
+    for name in (
+        *("cameras", "config", "corruption", "generators", "names", "runs", "tasks"),
+        *("variants", "video"),
+    )
 )
 """Modules of `core` whose sources decide results, in every stage."""
 
