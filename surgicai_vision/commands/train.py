@@ -182,6 +182,8 @@ class Options:
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode what is not in the cache, train and print where the checkpoint is."""
     _refuse_unread(options)
+    if options.out and options.seeds > 1:
+        raise InputError("--out names one folder; leave it out where --seeds trains several.")
     if options.low:
         return _high_level(options, options.low, console)
     if options.residual_on:
@@ -378,8 +380,6 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
         )
         for index in range(options.seeds)
     ]
-    if options.out and options.seeds > 1:
-        raise InputError("--out names one folder; leave it out where --seeds trains several.")
     from surgicai_vision.rl.train import run_of, train_seeds
 
     outs = _checked_folders(options, [run_of(request) for request in requests])
@@ -422,8 +422,6 @@ def _high_level(options: Options, low: Path, console: Console) -> dict[str, obje
             f"--low goes with --task {names.SUTURE} --algo ppo; got --task {options.task} --algo "
             f"{options.algo}."
         )
-    if options.out and options.seeds > 1:
-        raise InputError("--out names one folder; leave it out where --seeds trains several.")
     check_extra("--low", "stable_baselines3")
     config = read_hierarchical(low)
     requests = [
@@ -455,8 +453,6 @@ def _residual(options: Options, base: Path, console: Console) -> dict[str, objec
 
     if options.algo != ALGO:
         raise InputError(f"--residual-on goes with --algo {ALGO}; got --algo {options.algo}.")
-    if options.out and options.seeds > 1:
-        raise InputError("--out names one folder; leave it out where --seeds trains several.")
     check_extra("--residual-on", "stable_baselines3")
     requests = [
         ResidualRequest(

@@ -23,6 +23,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.processes import Child
 from surgicai_vision.core.tasks import task_steps
@@ -54,8 +55,9 @@ def make_vector(
         **arguments: what `envs.make_task` takes, without `max_steps`.
     """
     refuse_max_steps(arguments)
-    actions = max_episode_steps or task_steps(arguments["task"])
-    arguments["max_steps"] = actions * arguments.get("action_repeat", 1)
+    # An env of another distribution ends its episodes itself, after so many control steps.
+    own = task_steps(arguments["task"]) if arguments["task"] in names.TASKS else 0
+    arguments["max_steps"] = (max_episode_steps or own) * arguments.get("action_repeat", 1)
     return vector_of(num_envs, workers, AutoresetMode(autoreset_mode), arguments)
 
 

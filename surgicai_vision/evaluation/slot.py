@@ -13,6 +13,7 @@ take the same steps, so what a person watches is what an evaluation measures.
 
 import math
 import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, final
 
@@ -59,14 +60,27 @@ class Episode:
 
 def env_of(agent: Agent, config: TaskConfig) -> Env:
     """Make an env that shows what the agent sees, and renders an image only when it is accessed."""
-    cameras = tuple(agent.cameras)
+    return env_showing(
+        config, agent.cameras, agent.image_size, depth=agent.depth, action_mode=agent.action_mode
+    )
+
+
+def env_showing(
+    config: TaskConfig,
+    cameras: Sequence[str],
+    image_size: int,
+    *,
+    depth: bool = False,
+    action_mode: str = names.INCREMENTS,
+) -> Env:
+    """Make an env that shows these cameras, each image rendered only when it is accessed."""
     env = envs.make(
         config,
         obs_type="pixels_agent_pos" if cameras else "state",
         cameras=cameras,
-        image_size=agent.image_size,
-        depth=agent.depth,
-        action_mode=agent.action_mode,
+        image_size=image_size,
+        depth=depth,
+        action_mode=action_mode,
     )
     if cameras:
         env.defer_images()

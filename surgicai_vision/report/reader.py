@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from surgicai_vision.core import files
 from surgicai_vision.core.config import TaskConfig, from_mapping
-from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.errors import BadFile, SurgicaiError
 from surgicai_vision.core.untrusted import checked, finite_number
 from surgicai_vision.evaluation.storage import (
     FAILED_FILE,
@@ -27,6 +27,8 @@ from surgicai_vision.evaluation.storage import (
     read_versioned,
 )
 from surgicai_vision.report.experiment_key import Condition, condition_of, order
+from surgicai_vision.training.checkpoint import read_checkpoint
+from surgicai_vision.training.released import resolve
 from surgicai_vision.training.run_config import REFERENCES, RunConfig
 
 __all__ = ["REFERENCES", "Collected", "Missing", "PlannedRun", "Result", "collect", "read_results"]
@@ -100,6 +102,20 @@ class Result:
     def seed(self) -> int:
         """The training seed."""
         return self.run.seed
+
+    @cached_property
+    def own_env(self) -> TaskConfig:
+        """The env in which `evaluate` runs its policy unless it is given another.
+
+        It is the task's for a reference, and that of the training for a policy. The training's
+        step limit and rules are known only where its checkpoint still is.
+        """
+        if not self.trained:
+            return TaskConfig(self.run.task)
+        try:
+            return read_checkpoint(resolve(str(self.about.get("folder", "")))).task
+        except SurgicaiError:
+            return self.run.recorded_in or self.config
 
     @cached_property
     def condition(self) -> Condition:

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core import files
-from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.evaluation.storage import parquet_bytes
@@ -26,8 +24,6 @@ from surgicai_vision.report.paper_comparison import paper_rate
 from surgicai_vision.report.reader import REFERENCES, Result
 from surgicai_vision.report.reinforcement import learned
 from surgicai_vision.report.reinforcement import markdown as learned_markdown
-from surgicai_vision.training.checkpoint import read_checkpoint
-from surgicai_vision.training.released import resolve
 
 FOLDER = "tables"
 
@@ -139,7 +135,7 @@ def evaluate_command(result: Result) -> str | None:
     condition = result.condition
     if not whole or not condition.plain or condition.name or result.run.is_hierarchical:
         return None
-    if result.run.acted_by or result.config != _own_env(result):
+    if result.run.acted_by or result.config != result.own_env:
         return None
     ending = f"--task {result.summary['task']} --episodes {len(seeds)} --seed {seeds[0]} --json"
     name = result.summary["policy"]
@@ -148,20 +144,6 @@ def evaluate_command(result: Result) -> str | None:
 
         return f"surgicai-vision evaluate {shlex.quote(str(about['folder']))} {ending}"
     return f"surgicai-vision evaluate {name} {ending}" if name in REFERENCES[:3] else None
-
-
-def _own_env(result: Result) -> TaskConfig:
-    """Return the env in which `evaluate` runs a result's policy unless it is given another.
-
-    It is the task's for a reference, and that of the training for a policy. The training's step
-    limit and rules are known only where its checkpoint still is.
-    """
-    if not result.trained:
-        return TaskConfig(result.run.task)
-    try:
-        return read_checkpoint(resolve(str(result.about.get("folder", "")))).task
-    except SurgicaiError:
-        return result.run.recorded_in or result.config
 
 
 def _filled(rows: list[dict[str, object]]) -> list[dict[str, object]]:

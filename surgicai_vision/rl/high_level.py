@@ -31,7 +31,7 @@ from stable_baselines3 import PPO
 from torch import nn
 
 from policies.base import Policy, Recipe
-from surgicai_vision import __version__, envs
+from surgicai_vision import __version__
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import PhysicsError
@@ -47,6 +47,7 @@ from surgicai_vision.evaluation.hierarchical import (
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.rollout import run_share
+from surgicai_vision.evaluation.slot import env_showing
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.rl.extractor import StandardExtractor
 from surgicai_vision.rl.high_level_config import HighLevelRequest
@@ -106,7 +107,7 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
     def __init__(self, config: HierarchicalConfig, task: TaskConfig, low: Sequence[Agent]):
         self.config = config
         self._low = list(low)
-        self._env = _env_for(self._low, task)
+        self._env = cast(Suture, env_showing(task, *common_images(self._low)))
         self._observation: Any = None
         self._decisions = 0
         self.control_steps = 0
@@ -168,16 +169,6 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
     def close(self) -> None:
         """Free the simulator."""
         self._env.close()
-
-
-def _env_for(agents: Sequence[Agent], task: TaskConfig) -> Suture:
-    """Make the env of the whole procedure, with the images that any of the agents sees."""
-    cameras, image_size = common_images(agents)
-    obs_type = "pixels_agent_pos" if cameras else "state"
-    env = cast(Suture, envs.make(task, obs_type, cameras, image_size))
-    if cameras:
-        env.defer_images()
-    return env
 
 
 def train_high_level(

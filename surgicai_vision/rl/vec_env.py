@@ -51,12 +51,7 @@ class SuturingVecEnv(VecEnv):
         limit = arguments.pop("max_steps", 0)
         self._arguments = {"task": task, "max_steps": limit, **arguments}
         # a vector env of gymnasium declares neither `call` nor lists of seeds
-        self._vector: Any = vector_of(
-            n_envs,
-            workers,
-            AutoresetMode.SAME_STEP,
-            self._arguments,
-        )
+        self._vector: Any = vector_of(n_envs, workers, AutoresetMode.SAME_STEP, self._arguments)
         self._local = make_task(**self._arguments)
         self._actions: NDArray[np.float32] = np.zeros((n_envs, 7), np.float32)
         self._returns: NDArray[np.float64] = np.zeros(n_envs)

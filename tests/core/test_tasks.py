@@ -77,6 +77,10 @@ def test_a_registered_task_is_one_of_all(hover: type[Subtask]) -> None:
         steps += 1
     assert steps == 40
     assert not info["is_success"]
+    held = gymnasium.make_vec("surgicai_vision/HoverNear-v0", 1, action_repeat=2)
+    held.reset(seed=0)
+    ends = [held.step(np.zeros((1, 7), np.float32))[3].item() for _ in range(20)]
+    assert ends == [False] * 19 + [True], "it ends its episodes itself, after 40 control steps"
     with pytest.raises(NameCollision, match="hover_near"):
         surgicai_vision.register_task(Hover)
 
