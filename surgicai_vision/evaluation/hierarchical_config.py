@@ -20,6 +20,8 @@ from surgicai_vision.core.files import read_yaml
 from surgicai_vision.training.run_config import TERMINATIONS
 
 ORDER = "order"
+HLP = "hlp"
+"""Name of the high-level policy, and of its kind."""
 SUFFIXES = (".yaml", ".yml")
 MAX_STEPS = 2000
 """Control steps of an episode: ten subtasks of full length."""

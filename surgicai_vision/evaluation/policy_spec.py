@@ -46,6 +46,7 @@ from surgicai_vision.evaluation.agents import (
 from surgicai_vision.evaluation.chunk_agent import ChunkAgent
 from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
 from surgicai_vision.evaluation.hierarchical_config import (
+    HLP,
     ORDER,
     SUFFIXES,
     HierarchicalConfig,
@@ -447,56 +448,69 @@ def hierarchical_policy(
         BadFile: a folder that is no checkpoint.
         InputError: a policy of another subtask or scene than it is to act in.
     """
+    low = {subtask: _low_level(subtask, policy, weights) for subtask, policy in config.low.items()}
+    agents = {subtask: spec.make_agent for subtask, spec in low.items()}
     # The env is the one that the trained policies have in common; experts belong to no scene.
-    known: dict[str, RunConfig] = {}
-    low: dict[str, MakeAgent] = {}
-    parts: dict[str, JSON] = {}
-    sees_goal = expert_swap is not None
-    for subtask, policy in config.low.items():
-        if _names_code(policy):
-            raise InputError(
-                f"{subtask}: {policy} names code, which is not allowed in a file; give "
-                f"a checkpoint or a baseline ({', '.join(BASELINES)})."
-            )
-        spec = open_policy(policy, task=subtask, weights=weights)
-        low[subtask] = spec.make_agent
-        sees_goal |= spec.run.sees_goal
-        if spec.run.is_trained:
-            known[subtask] = spec.run
-            parts[subtask] = spec.about["checkpoint"]
+    trained = {subtask: spec.run for subtask, spec in low.items() if spec.run.is_trained}
+    parts = {subtask: low[subtask].about["checkpoint"] for subtask in trained}
     about: dict[str, JSON] = {"hierarchical": to_mapping(config)}
     high: functools.partial[PolicyAgent] | None = None
     if config.hlp != ORDER:
         folder = released.resolve(config.hlp)
-        checkpoint = read_checkpoint(folder)
-        if checkpoint.policy != "hlp" or checkpoint.task.task != names.SUTURE:
-            raise InputError(
-                f"{config.hlp} is '{checkpoint.policy}' of '{checkpoint.task.task}'; "
-                "hlp: takes an 'hlp' of 'suture'."
-            )
+        checkpoint = _read_high_level(config.hlp, folder)
         if checkpoint.stage_errors is not None:
             about["high_level"] = {
                 "policy_sha256": checkpoint.policy_sha256,
                 "stage_errors": to_mapping(checkpoint.stage_errors),
             }
-        known["hlp"] = checkpoint.run
-        parts["hlp"] = _hashes(checkpoint)
+        trained[HLP] = checkpoint.run
+        parts[HLP] = _hashes(checkpoint)
         high = functools.partial(policy_agent, folder, weights)
-    env = _common_env([run.env for run in known.values()])
+    env = _common_env([run.env for run in trained.values()])
     if expert_swap is not None:
-        low[check_name("subtask", expert_swap, names.SUBTASKS)] = BASELINES["expert"]
-        known.pop(expert_swap, None)
+        agents[check_name("subtask", expert_swap, names.SUBTASKS)] = BASELINES["expert"]
+        trained.pop(expert_swap, None)
         parts.pop(expert_swap, None)
     if parts:
         about["parts"] = parts
-    seen = {view for run in known.values() for view in run.views}
+    seen = {view for run in trained.values() for view in run.views}
     run = RunConfig(
         replace(env, task=names.SUTURE, max_steps=config.max_steps, advance=config.advance),
         views=tuple(view for view in view_names() if view in seen),
-        privileged=sees_goal,
+        privileged=expert_swap is not None or any(spec.run.sees_goal for spec in low.values()),
         termination=config.termination,
         parts=digest(config),
         expert_swap=expert_swap,
     )
-    make = functools.partial(HierarchicalAgent, config, tuple(low.values()), high)
+    make = functools.partial(HierarchicalAgent, config, tuple(agents.values()), high)
     return PolicySpec(run, make, about)
+
+
+def _low_level(subtask: str, policy: str, weights: WeightsSource) -> PolicySpec:
+    """Return the policy of a subtask, named in the file of a hierarchical policy.
+
+    Raises:
+        InputError: it names code, or was trained for another subtask.
+    """
+    if _names_code(policy):
+        raise InputError(
+            f"{subtask}: {policy} names code, which is not allowed in a file; give "
+            f"a checkpoint or a baseline ({', '.join(BASELINES)})."
+        )
+    return open_policy(policy, task=subtask, weights=weights)
+
+
+def _read_high_level(given: str, folder: Path) -> Checkpoint:
+    """Return the checkpoint of a high-level policy, named `given` in a hierarchical policy's file.
+
+    Raises:
+        BadFile: no checkpoint folder.
+        InputError: another policy, or one of a single subtask.
+    """
+    checkpoint = read_checkpoint(folder)
+    if checkpoint.policy != HLP or checkpoint.task.task != names.SUTURE:
+        raise InputError(
+            f"{given} is '{checkpoint.policy}' of '{checkpoint.task.task}'; "
+            f"hlp: takes an '{HLP}' of '{names.SUTURE}'."
+        )
+    return checkpoint

@@ -7,6 +7,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.banks import BANKS
 from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
+from surgicai_vision.evaluation.hierarchical_config import HLP
 from surgicai_vision.evaluation.robustness.axes import AXES
 from surgicai_vision.experiments.dataset_config import (
     MOST_EPISODES,
@@ -14,7 +15,7 @@ from surgicai_vision.experiments.dataset_config import (
     Demonstrations,
     first_seed,
 )
-from surgicai_vision.experiments.plan_parts import HLP, PARTS, Condition, PlannedPolicy
+from surgicai_vision.experiments.plan_parts import PARTS, Condition, PlannedPolicy
 from surgicai_vision.features import encoders
 from surgicai_vision.training.run_config import RunConfig
 

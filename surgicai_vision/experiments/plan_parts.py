@@ -5,10 +5,9 @@ from dataclasses import dataclass, field
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON
+from surgicai_vision.evaluation.hierarchical_config import HLP
 from surgicai_vision.training.run_config import Shift
 
-HLP = "hlp"
-"""Name of the high-level policy, and of its kind."""
 PARTS = (*names.SUBTASKS, HLP)
 """The parts of the whole procedure."""
 AS_TRAINED = "as trained"

@@ -44,7 +44,7 @@ from surgicai_vision.evaluation.hierarchical import (
     common_images,
     leave_held_grasp,
 )
-from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical_config import HLP, HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.rollout import run_share
 from surgicai_vision.evaluation.slot import env_showing
@@ -60,7 +60,6 @@ from surgicai_vision.training.policies import policy_plugin
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
 
-HLP = "hlp"
 ALGO = "ppo"
 SMALLEST_STD = 1e-3
 """Inputs that vary less [m, rad] are divided by this."""

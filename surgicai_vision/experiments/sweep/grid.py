@@ -19,6 +19,7 @@ from surgicai_vision.core.config import (
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
 from surgicai_vision.demos.disturbance import Disturbance
+from surgicai_vision.evaluation.hierarchical_config import HLP
 from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrations
 from surgicai_vision.experiments.sweep.experiment import Evaluated, Training, check_runs
 from surgicai_vision.features import encoders
@@ -406,7 +407,7 @@ class Grid:
 
 
 def parts_of(run: RunConfig) -> dict[str, RunConfig]:
-    """Return the policies of a hierarchical run: "hlp", and each subtask's except the one swapped.
+    """Return the policies of a hierarchical run: `HLP`, and each subtask's except the one swapped.
 
     The high-level policy has its own recipe where `HIGH_LEVEL` names one.
     """
@@ -417,7 +418,7 @@ def parts_of(run: RunConfig) -> dict[str, RunConfig]:
         if subtask != run.expert_swap
     }
     recipe = HIGH_LEVEL.get(run.recipe, run.recipe)
-    return {"hlp": replace(alone, policy="hlp", recipe=recipe), **low}
+    return {HLP: replace(alone, policy=HLP, recipe=recipe), **low}
 
 
 def with_task(config: TaskConfig, task: str) -> TaskConfig:

@@ -14,7 +14,7 @@ from surgicai_vision.core.config import JSON, from_mapping, read_changes
 from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import silent_stage, timed
 from surgicai_vision.demos.store import demos_digest, list_demos
-from surgicai_vision.evaluation.hierarchical_config import ORDER, HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical_config import HLP, ORDER, HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import PolicySpec, hierarchical_policy, open_policy
 from surgicai_vision.evaluation.storage import RESULT_FILE
 from surgicai_vision.experiments.sweep.jobs import Table, evaluate_as
@@ -79,7 +79,7 @@ def train_and_evaluate(
         place = str(Path(final) / POLICY)
         kept: dict[str, JSON] = {"command": command, "folder": place}
         if what.is_hierarchical:
-            kept["hierarchical"] = {**policies, "hlp": place, "termination": what.termination}
+            kept["hierarchical"] = {**policies, HLP: place, "termination": what.termination}
         with measured("evaluation", "steps"):
             summary = evaluate_as(folder / "evaluation", spec, what, {**spec.about, **kept})
     write_json(folder / RESULT_FILE, {"run": run, "summary": summary, "seconds": seconds})
@@ -112,9 +112,9 @@ def _procedure(
 ) -> PolicySpec:
     """Train PPO over the low-level policies, or continue it; return the hierarchical policy."""
     low = from_mapping(
-        HierarchicalConfig, {**policies, "hlp": ORDER, "termination": run.termination}, "procedure"
+        HierarchicalConfig, {**policies, HLP: ORDER, "termination": run.termination}, "procedure"
     )
     request = HighLevelRequest(low, decisions, seed=run.seed, validation=validation)
     train_high_level(request, scratch / POLICY)
-    whole = {**policies, "hlp": str(scratch / POLICY), "termination": run.termination}
+    whole = {**policies, HLP: str(scratch / POLICY), "termination": run.termination}
     return hierarchical_policy(from_mapping(HierarchicalConfig, whole, "procedure"))
