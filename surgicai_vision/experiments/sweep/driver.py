@@ -239,7 +239,7 @@ class _Sweep:
                         self._fail(state, error)
         self._renew()
         live = [state for state in to_do if state.key not in self.errors]
-        self._share("features", [job for state in live for job in self.jobs.features(state.run)])
+        self._make_features(live)
         self._train_parts(live)
 
     def _make_dataset(self, name: str) -> None:
@@ -277,21 +277,14 @@ class _Sweep:
                 ended=ended,
             )
 
-    def _share(self, title: str, jobs: Iterable[Job]) -> dict[str, SurgicaiError]:
-        """Do jobs, each once; return the errors by key.
+    def _make_features(self, states: Sequence[RunState]) -> None:
+        """Encode what runs see, each once.
 
         What fails here fails again in the run and is reported there.
         """
-        once = {job.key(): job for job in jobs}
-        errors: dict[str, SurgicaiError] = {}
-
-        def ended(job: Job, folder: Path, error: SurgicaiError | None) -> None:
-            if error:
-                errors[job.key()] = error
-
-        if once:
-            self._run(title, list(once.values()), ended)
-        return errors
+        jobs = {job.key(): job for state in states for job in self.jobs.features(state.run)}
+        if jobs:
+            self._run("features", list(jobs.values()), lambda job, folder, error: None)
 
     def _train_parts(self, states: Sequence[RunState]) -> None:
         """Train the policies that runs share and file them; a run that lacks one fails."""
@@ -304,73 +297,79 @@ class _Sweep:
                     self._fail(state, error)
 
     def _train(self, policies: Iterable[Training]) -> dict[str, SurgicaiError]:
-        """Train policies that are not there yet and file them; return the errors by key."""
-        parts = {self.jobs.policy(policy).key(): policy for policy in policies}
-        places = {
-            key: _Place(self.jobs.policy_folder(part), JOB_FILE) for key, part in parts.items()
-        }
-        self._file_finished(places)
-        missing = [part for key, part in parts.items() if not places[key].holds(key)]
-
-        def ended(job: Job, folder: Path, error: SurgicaiError | None) -> None:
-            if error is None:
-                _file(folder, places[folder.name], folder.name)
-            else:
-                errors[job.key()] = error
-
+        """Train policies that are not there yet and file them; return the errors by job's key."""
         errors: dict[str, SurgicaiError] = {}
-        if missing:
-            self._run("policies", [self.jobs.policy(part) for part in missing], ended)
+        placed = [
+            (self.jobs.policy(policy), _Place(self.jobs.policy_folder(policy), JOB_FILE))
+            for policy in policies
+        ]
+        self._do_and_file("policies", placed, lambda job, place, error: errors.update({job: error}))
         return errors
 
     def do(self, to_do: Sequence[RunState]) -> None:
         """Do the runs and the references, and file each as it ends."""
-        places: dict[str, _Place] = {}
-        jobs = []
-        for state in to_do:
-            if state.key not in self.errors:
-                job = self.jobs.run(state.run)
-                jobs.append(job)
-                places[job.key()] = _Place(run_folder(self.out, state.key), RESULT_FILE, state)
-        for run in self.references:
-            if not self._is_filed_reference(run):
-                job = self.jobs.reference(run)
-                jobs.append(job)
-                places[job.key()] = _Place(self._reference_folder(run), REFERENCE_FILE)
-        self._file_finished(places)
-        left = [job for job in jobs if not places[job.key()].holds(job.key())]
+        placed = [
+            (self.jobs.run(state.run), _Place(run_folder(self.out, state.key), RESULT_FILE, state))
+            for state in to_do
+            if state.key not in self.errors
+        ]
+        placed += [
+            (self.jobs.reference(run), _Place(self._reference_folder(run), REFERENCE_FILE))
+            for run in self.references
+            if not self._is_filed_reference(run)
+        ]
 
-        def ended(job: Job, folder: Path, error: SurgicaiError | None) -> None:
-            place = places[folder.name]
-            if error is None:
-                _file(folder, place, folder.name)
-            elif place.state:
+        def failed(job: str, place: _Place, error: SurgicaiError) -> None:
+            if place.state:
                 self._fail(place.state, error)
             else:
-                self.problems.append(f"failed: {place.folder.name}: {' '.join(str(error).split())}")
+                self._note(place.folder.name, error)
 
-        if left:
-            self._run("runs", left, ended)
+        self._do_and_file("runs", placed, failed)
 
     def probe(self, runs: Sequence[RunConfig]) -> None:
         """Probe what the runs see, if the grid requests it."""
         wanted = self.jobs.probes(runs) if self.experiment.probe else {}
-        places = {
-            job.key(): _Place(self.out / "probes" / name, PROBE_FILE)
-            for name, job in wanted.items()
-        }
-        missing = [job for job in wanted.values() if not places[job.key()].holds(job.key())]
-        errors = self._share("probes", missing)
-        self._file_finished(places)
-        for key, error in errors.items():
-            name = places[key].folder.name
-            self.problems.append(f"failed: probe {name}: {' '.join(str(error).split())}")
+        placed = [
+            (job, _Place(self.out / "probes" / name, PROBE_FILE)) for name, job in wanted.items()
+        ]
+        self._do_and_file(
+            "probes",
+            placed,
+            lambda job, place, error: self._note(f"probe {place.folder.name}", error),
+        )
 
-    def _file_finished(self, places: dict[str, _Place]) -> None:
-        """File what is finished and not filed yet, by this call or by one that was killed."""
-        for key, place in places.items():
-            if (self.out / WORK / key).is_dir():
+    def _do_and_file(
+        self,
+        title: str,
+        placed: Iterable[tuple[Job, _Place]],
+        failed: Callable[[str, _Place, SurgicaiError], None],
+    ) -> None:
+        """Do the jobs that are not done yet, each once, and file each as it ends.
+
+        Args:
+            title: what the progress display calls them.
+            placed: each job and where its result is filed.
+            failed: called with the key and the place of each job that failed, as it ends.
+        """
+        by_key = {job.key(): (job, place) for job, place in placed}
+        left = []
+        for key, (job, place) in by_key.items():
+            if (self.out / WORK / key).is_dir():  # finished by a call that was killed
                 _file(self.out / WORK / key, place, key)
+            if not place.holds(key):
+                left.append(job)
+
+        def ended(job: Job, folder: Path, error: SurgicaiError | None) -> None:
+            key = folder.name
+            _, place = by_key[key]
+            if error is None:
+                _file(folder, place, key)
+            else:
+                failed(key, place, error)
+
+        if left:
+            self._run(title, left, ended)
 
     def _is_filed_reference(self, run: RunConfig) -> bool:
         place = _Place(self._reference_folder(run), REFERENCE_FILE)
@@ -379,6 +378,10 @@ class _Sweep:
     def _reference_folder(self, run: RunConfig) -> Path:
         parts = [run.policy, run.task, *([run.condition] if run.condition else [])]
         return self.out / "references" / "-".join(parts)
+
+    def _note(self, what: str, error: SurgicaiError) -> None:
+        """Note what went wrong outside the runs, in one line."""
+        self.problems.append(f"failed: {what}: {' '.join(str(error).split())}")
 
     def _fail(self, state: RunState, error: SurgicaiError) -> None:
         """Store a run's error, with the traceback where it was none of ours.
