@@ -6,7 +6,14 @@ from typing import final
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, SuccessRule, TaskConfig, from_mapping
-from surgicai_vision.core.errors import InputError, UnknownName, check_name, check_positive
+from surgicai_vision.core.errors import (
+    InputError,
+    UnknownName,
+    check_at_least,
+    check_finite,
+    check_name,
+    check_positive,
+)
 from surgicai_vision.core.tasks import load_subtask
 from surgicai_vision.rl.algorithms import ALGORITHMS, Algorithm
 
@@ -110,6 +117,19 @@ class Settings:
             goals=self.goals,
             rollout=self.rollout,
             samples=self.samples,
+        )
+        check_at_least(
+            0,
+            learning_starts=self.learning_starts,
+            actor_starts=self.actor_starts,
+            exploration_noise=self.exploration_noise,
+            target_noise=self.target_noise,
+            target_noise_clip=self.target_noise_clip,
+        )
+        check_finite(
+            learning_rate=self.learning_rate,
+            exploration_noise=self.exploration_noise,
+            target_noise=self.target_noise,
         )
         for name in ("gamma", "tau", "demo_share", "bc_weight"):
             if not 0 < getattr(self, name) < 1:

@@ -264,6 +264,9 @@ def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, caps
     assert "imitation" in refused("sac", "--view", "front")
     assert "several" in refused("td3-her", "--task", "suture")
     assert "at least 201, or 0" in refused("td3-her", "--change", "learning_starts=200")
+    assert "at least 0" in refused("td3", "--change", "learning_starts=-1")
+    assert "at least 0" in refused("td3", "--change", "exploration_noise=-0.1")
+    assert "finite" in refused("td3", "--change", "learning_rate=.inf")
     shown = ("--demos", str(demos["grasp"]))
     for algo, share, rows in (("td3-bc", 0.001, 0), ("rlpd", 0.999, 256)):
         assert f"{rows} of the 256" in refused(algo, *shown, "--change", f"demo_share={share}")
