@@ -2,11 +2,17 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import final
+from typing import TYPE_CHECKING, final
 
 from cyclopts import Parameter
 
 from surgicai_vision.core.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from rich.console import OverflowMethod
+
+TITLE_WIDTH = 38
+"""Columns of a stage's title [characters], so that the bars of most stages are aligned."""
 
 
 @final
@@ -29,9 +35,14 @@ class Console:
         """Show a progress bar for one stage; yields the function that moves it."""
         from rich import progress as rich_progress
         from rich.console import Console as Rich
+        from rich.text import Text
 
+        # Where the line is too narrow, only the title is cut: it alone may be narrower than its text.
+        overflow: OverflowMethod = "ellipsis" if len(title) > TITLE_WIDTH else "crop"
         columns = (
-            rich_progress.TextColumn("{task.description:<38}"),
+            rich_progress.RenderableColumn(
+                Text(title.ljust(TITLE_WIDTH), no_wrap=True, overflow=overflow)
+            ),
             rich_progress.BarColumn(bar_width=20),
             rich_progress.MofNCompleteColumn(),
             rich_progress.TextColumn("{task.fields[unit]}"),

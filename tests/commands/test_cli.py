@@ -16,7 +16,7 @@ from cyclopts import Parameter
 from read_options import read_options
 
 from surgicai_vision.commands import COMMANDS, dataset, evaluate, policy, quickstart, robot
-from surgicai_vision.commands.console import QuietConsole
+from surgicai_vision.commands.console import Console, QuietConsole
 from surgicai_vision.commands.main import INTERRUPTED, main
 from surgicai_vision.commands.options import COUNT, FILE_ONLY, VIEWS
 from surgicai_vision.core import names
@@ -439,6 +439,17 @@ def test_quiet_console_shows_nothing(capsys):
     with console.stage("a") as progress:
         progress(1, 2)
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("title", ["short", "policy: " + "a-setting=0.98 [of] " * 8])
+def test_a_narrow_line_of_progress_cuts_the_title_and_no_number(title, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with Console().stage(title, "control steps") as progress:
+        progress(7500, 7500)
+    line = capsys.readouterr().err
+    assert "7500/7500 control steps 00:00" in line
+    assert line.startswith(title[:20])
+    assert ("…" in line) == (title != "short")
 
 
 def test_scene_draws_the_sheet(capsys, tmp_path):
