@@ -37,7 +37,7 @@ class Console:
         from rich.console import Console as Rich
         from rich.text import Text
 
-        # Where the line is too narrow, only the title is cut: it alone may be narrower than its text.
+        # Where the line is too narrow, the title alone is cut: it may be narrower than its text.
         overflow: OverflowMethod = "ellipsis" if len(title) > TITLE_WIDTH else "crop"
         columns = (
             rich_progress.RenderableColumn(
