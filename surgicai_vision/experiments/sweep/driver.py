@@ -316,7 +316,6 @@ class _Sweep:
         placed += [
             (self.jobs.reference(run), _Place(self._reference_folder(run), REFERENCE_FILE))
             for run in self.references
-            if not self._is_filed_reference(run)
         ]
 
         def failed(job: str, place: _Place, error: SurgicaiError) -> None:
