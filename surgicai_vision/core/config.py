@@ -332,6 +332,11 @@ class TaskConfig:
         if self.max_steps == 0:
             object.__setattr__(self, "max_steps", task_steps(self.task))
 
+    @property
+    def steps_per_second(self) -> int:
+        """Steps of simulated time per second, each with an action of its own, rounded down."""
+        return names.FPS // self.action_repeat
+
 
 def world_text(env: TaskConfig) -> str:
     """Return what is unusual in the world of an env: in its scene, and what varies.

@@ -241,7 +241,7 @@ def _replay(dataset: "Dataset") -> PolicySpec:
     Raises:
         InputError: a dataset without a frame of every step.
     """
-    needed = names.FPS // dataset.config.action_repeat
+    needed = dataset.config.steps_per_second
     if dataset.fps != needed:
         raise InputError(
             f"{dataset.path} holds {dataset.fps} frames per second; "

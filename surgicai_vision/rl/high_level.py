@@ -193,12 +193,14 @@ def train_high_level(
     """
     spec = hierarchical_policy(request.low, weights=weights)
     low = [open_policy(path, task=task, weights=weights) for task, path in request.low.low.items()]
+    agents = [one.make_agent() for one in low]
+    common_images(agents)  # refuses images of several sizes before the folder is begun
     acting = [one.about.get("checkpoint") or one.name for one in low]
     wanted = {"code_version": __version__, "request": to_mapping(request), "low": acting}
     if done := begin(out, wanted):
         return done
     with torch.random.fork_rng(devices=[]), one_thread():
-        env = DecisionEnv(request.low, spec.config, [one.make_agent() for one in low])
+        env = DecisionEnv(request.low, spec.config, agents)
         try:
             make_low = [one.make_agent for one in low]
             checkpoint = _run(request, spec.config, make_low, env, out, progress or silent)

@@ -60,7 +60,7 @@ def timeline_of(dataset: Dataset, demos: Path | None = None) -> Timeline:
         InputError: frames were left out, and the demonstrations are missing or different ones.
     """
     root = _root(dataset)
-    if root.fps == names.FPS:
+    if root.fps == root.config.steps_per_second:
         columns = root.columns()
         phase = columns.get(names.PHASE)
         index = np.asarray(root.episode_index)
@@ -74,7 +74,7 @@ def _from_demos(dataset: Dataset, folder: Path) -> Timeline:
     """Return the timeline of a dataset whose demonstrations lie in `folder`."""
     need = (
         f"{dataset.path} holds {dataset.fps} frames per second, and a policy that plans chunks "
-        f"learns from the action of every control step, {names.FPS} per second"
+        f"learns from the action of every step, {dataset.config.steps_per_second} per second"
     )
     try:
         paths = list_demos(folder)

@@ -1,6 +1,7 @@
 """PPO over low-level policies: its env is the hierarchical policy's, its checkpoint is an HLP."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -168,6 +169,19 @@ def test_a_kill_changes_no_result(tmp_path, temporary, monkeypatch):
     monkeypatch.setattr(high_level, "_save", original)
     resumed = train_high_level(request_of(), tmp_path / "killed")
     assert resumed.policy_sha256 == whole.policy_sha256
+
+
+def test_images_of_several_sizes_are_refused_before_the_folder_is_begun(tmp_path, monkeypatch):
+    sizes = iter((16, 32, 16, 16, 16))
+
+    def opened(path, **options):
+        size = next(sizes)
+        return SimpleNamespace(name=path, about={}, make_agent=lambda: Looking("front", size))
+
+    monkeypatch.setattr(high_level, "open_policy", opened)
+    with pytest.raises(InputError, match=r"\[16, 32\] pixels"):
+        train_high_level(request_of(), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_learned_termination_is_refused():

@@ -157,6 +157,12 @@ def test_a_dataset_of_held_actions_has_each_of_them_once(tmp_path: Path) -> None
     timeline = timeline_of(dataset)
     actions = dataset.columns()[names.ACTION]
     np.testing.assert_array_equal(timeline.action[timeline.step], actions)
+    render_demos(
+        tmp_path / "demos", tmp_path / "elsewhere/set", views=("back",), size=16, context=context
+    )
+    every = open_dataset(tmp_path / "elsewhere/set")  # far from its demonstrations
+    assert every.fps == names.FPS // 2
+    np.testing.assert_array_equal(timeline_of(every).action, timeline.action)
 
 
 def test_earlier_rows_stay_within_their_episode() -> None:

@@ -83,9 +83,10 @@ def train_lerobot(
         InputError: a dataset without a frame of every step.
         SurgicaiError: LeRobot failed; the message ends with its last output.
     """
-    if dataset.fps != names.FPS:
+    needed = dataset.config.steps_per_second
+    if dataset.fps != needed:
         raise InputError(
-            f"{dataset.path} holds {dataset.fps} frames per second; {run.policy} needs {names.FPS}."
+            f"{dataset.path} holds {dataset.fps} frames per second; {run.policy} needs {needed}."
         )
     root = dataset.path
     if run.encoder != OWN:
