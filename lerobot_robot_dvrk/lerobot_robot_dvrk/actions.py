@@ -126,7 +126,8 @@ class Delta:
         forward, left, up = (float(action.get(name, 0.0)) for name in self.features[:3])
         jaw = float(action.get("gripper", 1.0)) - 1.0
         arm = robot.active
-        return {arm: _in_base(robot, arm, [left, up, forward, 0.0, 0.0, 0.0, jaw])}
+        asked = _shortened(robot, arm, [left, up, forward, 0.0, 0.0, 0.0, jaw])
+        return {arm: _in_base(robot, arm, asked)}
 
     def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
         """Return nothing."""
@@ -181,9 +182,9 @@ class Leader:
             if arm not in self.arms and arm != robot.active:
                 waiting[:] = [0.0] * 7
                 continue
-            now = [min(max(value, -1.0), 1.0) for value in waiting]
-            waiting[:] = [value - part for value, part in zip(waiting, now, strict=True)]
-            moves[arm] = _in_base(robot, arm, now)
+            sent = _shortened(robot, arm, [min(max(value, -1.0), 1.0) for value in waiting])
+            waiting[:] = [value - part for value, part in zip(waiting, sent, strict=True)]
+            moves[arm] = _in_base(robot, arm, sent)
         return moves
 
     def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
@@ -271,3 +272,14 @@ def _in_base(robot: DrivenRobot, arm: str, values: list[float]) -> list[float]:
     moved = poses.transform((*nowhere, *turn), (a, b, c))
     turned = poses.transform((*nowhere, *turn), (d, e, f))
     return [*moved, *turned, jaw]
+
+
+def _shortened(robot: DrivenRobot, arm: str, values: list[float]) -> list[float]:
+    """Return increments in the view's axes that are within [-1, 1] in an arm's base.
+
+    Translation and rotation are each shortened as a whole, so that their directions stay.
+    """
+    turned = _in_base(robot, arm, values)
+    shares = [1.0 / max(1.0, *map(abs, part)) for part in (turned[:3], turned[3:6])]
+    moved = [shares[0] * value for value in values[:3]]
+    return [*moved, *(shares[1] * value for value in values[3:6]), values[6]]

@@ -68,6 +68,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         self._steps = 0
         self._solved: float | None = None
         self._told = ""
+        self._seen: dict[str, float | NDArray[np.uint8]] = {}
 
     # -- what LeRobot requires of any robot --------------------------------------------------------
 
@@ -140,6 +141,7 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
             self._client.connect()
             self._stack = stack.pop_all()
         self._reader.forget()
+        self._seen = {}
         if config.simulated:
             self._begin(config.seed)
         elif not drive.sends:
@@ -158,12 +160,28 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         stack.close()
 
     def get_observation(self) -> dict[str, float | NDArray[np.uint8]]:
-        """Return the current measurements and the newest images."""
+        """Return the current measurements and the newest images.
+
+        While they cannot be used, the last that could be are returned, and the log says why.
+
+        Raises:
+            DeviceNotConnectedError: the robot is not connected.
+            InputError: the measurements cannot be used, and none could be since it was connected.
+        """
         self._check_connected()
         self._client.update()
         self._observations += 1
         if self.config.simulated:
             self._follow_the_judge()
+        try:
+            self._seen = self._measured()
+        except InputError as error:
+            if not self._seen:
+                raise
+            self._tell(str(error))
+        return dict(self._seen)
+
+    def _measured(self) -> dict[str, float | NDArray[np.uint8]]:
         seen: dict[str, float | NDArray[np.uint8]] = {}
         if self.config.action == ABSOLUTE:
             seen.update(observed(self._robot))
@@ -228,10 +246,10 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         judged = self._client.judgement()
         if not judged:
             return
-        subtask = judged["subtask"]
+        subtask = judged.get("subtask")
         if self.config.task == names.SUTURE and subtask in names.SUBTASKS:
             self._robot.enter(names.SUBTASKS.index(str(subtask)))
-        BOARD.success = bool(judged["is_success"])
+        BOARD.success = bool(judged.get("is_success"))
         now = time.monotonic()
         if not BOARD.success:
             self._solved = None

@@ -39,7 +39,7 @@ A bag is a .bag, .db3 or .mcap file, or a ROS 2 folder; a folder of bags is read
 A LeRobot dataset (v2.1 or v3) of both arms' poses, as in Open-H-Embodiment and SutureBot:
   surgicai-vision import-demos datasets/suturing --out outputs/demos/suturing
 What a policy did on a robot, as logged by robot drive:
-  surgicai-vision import-demos outputs/drive/suture/drive.jsonl --out outputs/demos/driven
+  surgicai-vision import-demos outputs/drive/TASK-POLICY/drive.jsonl --out outputs/demos/driven
 Roles of --topic: {", ".join(ROLES)}.
 Without --task, every subtask that is found gets a folder below --out. Frames, units, labels and
 more are set in the table `bag` of a --config file, the scene in the table `env` (docs/demos.md).\

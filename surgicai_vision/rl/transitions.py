@@ -15,6 +15,7 @@ is 0; the few demonstrations that then fail are left out and counted.
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from surgicai_vision.core.config import SuccessRule, TaskConfig, from_mapping, t
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.files import write_bytes
 from surgicai_vision.core.progress import Progress
+from surgicai_vision.core.untrusted import checked, parse_json
 from surgicai_vision.demos.store import Demo, demos_digest, read_demo
 from surgicai_vision.envs.base import Observation, SuturingEnv
 
@@ -36,6 +38,11 @@ OBSERVATION = "observation"
 OBS_TYPES = ("relative", "state", "goal")
 """Observation types that transitions may have: arrays of numbers."""
 VERSION = 1
+DAMAGED = (
+    *(OSError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError),
+    *(ValueError, KeyError, TypeError),
+)
+"""What reading a damaged file, or one of something else, raises."""
 
 Arrays = Mapping[str, NDArray[np.float32]]
 
@@ -270,7 +277,7 @@ def read_transitions(path: Path) -> Transitions:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            about = json.loads(str(file["about"]))
+            about = checked(parse_json(str(file["about"]), str(path)), dict, str(path))
             if about.pop("version") != VERSION:
                 raise BadFile(f"{path} is of another format version; export the demos again.")
             config = from_mapping(TaskConfig, about.pop("config"), str(path))
@@ -284,5 +291,5 @@ def read_transitions(path: Path) -> Transitions:
             }
             fields |= {name: file[name] for name in _ARRAYS}
         return Transitions(config=config, **about, **fields)
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGED as error:
         raise BadFile(f"{path} is not a file of transitions ({error}).") from None

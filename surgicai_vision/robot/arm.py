@@ -5,7 +5,8 @@
 
 As in docs/ros_crtk_contract.md of dvrk_simulator_base: "Servo commands are superseding depth-one
 setpoints. Move and state commands remain ordered in a bounded queue. Invalid commands and queue
-overflow produce a warning without mutating backend state."
+overflow produce a warning without mutating backend state." A state command, which may be a stop,
+takes the place of the oldest waiting motion when the queue is full.
 
 Beyond the contract, since a wrong set point moves a robot: a motion command is refused if its stamp
 is older than `MAX_AGE_S`, or older than that of a command already accepted. If two clients move one
@@ -197,7 +198,7 @@ class Psm:
             waiting = [entry for entry in self._queue if entry.channel != channel]
             self._queue = deque(waiting)
         elif len(self._queue) >= QUEUE:
-            raise InputError(f"{QUEUE} commands are already waiting; this one is dropped.")
+            self._make_room(channel)
         self._queue.append(_Command(channel, payload))
 
     def stop(self, reason: str) -> None:
@@ -228,7 +229,7 @@ class Psm:
                     self.operating.command(str(command.payload))
                     self.notes.append(Note("info", f"{command.payload}: {self.operating.state}"))
                     if was_moving and not self.operating.may_move:
-                        self._forget_motions()
+                        self._trajectory = self._jaw_trajectory = None
                         joints = state.joints
                         changed = True
                 elif not self.operating.may_move:
@@ -289,6 +290,20 @@ class Psm:
 
     def _inverse(self, pose: Pose, near: Joints) -> Joints:
         return inverse_flat(pose, self.instrument, near)
+
+    def _make_room(self, channel: str) -> None:
+        """Drop the oldest waiting motion for a state command, which may be a stop.
+
+        Raises:
+            InputError: the command is a motion, or only state commands are waiting.
+        """
+        oldest = next((entry for entry in self._queue if entry.channel != STATE_COMMAND), None)
+        if channel != STATE_COMMAND or oldest is None:
+            raise InputError(f"{QUEUE} commands are already waiting; this one is dropped.")
+        self._queue.remove(oldest)
+        self.notes.append(
+            Note("warning", f"rejected {oldest.channel}: {QUEUE} commands were waiting")
+        )
 
     def _forget_motions(self) -> None:
         """Drop moves and all waiting motions."""

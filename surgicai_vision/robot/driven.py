@@ -5,6 +5,7 @@ Poses are those of the tip in the arm's base, as in the envs. If a robot's own f
 arm's `local/*` poses in our base of that arm; `tip` is T_tip_robot, the robot's tip frame in ours.
 """
 
+import io
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Pillow
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
@@ -234,18 +236,27 @@ class DrivenRobot:
         assert heard is not None, "the guards require an input first"
         message = heard.message
         if isinstance(message, CompressedImage):
-            frame = _decoded(message)
-        else:
-            assert isinstance(message, Image)
-            shape = (message.height, message.width, 3)
-            frame = np.frombuffer(message.data, np.uint8).reshape(shape)
-        if frame.shape[:2] != (self._size, self._size):
-            height, width = frame.shape[:2]
+            self._check_size(view, *_size_of(message))
+            return _decoded(message)
+        assert isinstance(message, Image)
+        self._check_size(view, message.height, message.width)
+        return np.frombuffer(message.data, np.uint8).reshape(self._size, self._size, 3)
+
+    def _check_size(self, view: str, height: int, width: int) -> None:
+        if (height, width) != (self._size, self._size):
             raise InputError(
                 f"the images of {view} are {height} × {width}; the policy sees "
                 f"{self._size} × {self._size}."
             )
-        return frame
+
+
+def _size_of(message: CompressedImage) -> tuple[int, int]:
+    """Return height and width of a compressed image [px]; only its header is read."""
+    try:
+        with Pillow.open(io.BytesIO(message.data), formats=("JPEG", "PNG")) as image:
+            return image.height, image.width
+    except (OSError, ValueError, SyntaxError, Pillow.DecompressionBombError):
+        raise InputError(_unreadable(message)) from None
 
 
 def _decoded(message: CompressedImage) -> NDArray[np.uint8]:
@@ -254,9 +265,13 @@ def _decoded(message: CompressedImage) -> NDArray[np.uint8]:
 
     found = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
     if found is None:
-        raise InputError(f"an image of format {message.format[:20]} cannot be read.")
+        raise InputError(_unreadable(message))
     frame: NDArray[np.uint8] = np.ascontiguousarray(found[..., ::-1]).astype(np.uint8, copy=False)
     return frame
+
+
+def _unreadable(message: CompressedImage) -> str:
+    return f"an image of format {message.format[:20]} cannot be read."
 
 
 def _pose_of(values: tuple[float, ...]) -> Pose:

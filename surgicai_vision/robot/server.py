@@ -69,10 +69,10 @@ PATIENCE_S = 1.0
 """Time for which a step waits for the commands it names [s]."""
 MAX_BEHIND_S = 0.1
 """Time by which the clock may lag before it is reset [s]; nothing is caught up in a burst."""
-
-
 REMEMBERED = 64
 """Requests that are recognised when they come twice; a client repeats one without an answer."""
+LONGEST_SEED = 18
+"""Digits of the longest seed that a reset may request."""
 
 
 @dataclass(frozen=True)
@@ -240,15 +240,17 @@ class Server:
         """Take new messages; if the client sets the clock, also step as requested."""
         for request in self._texts(self._resets):
             self._do(request, lambda text: self._reset(_seed(text)))
-            self._reset_sent = max(self._reset_sent, request.sent)
+            # No later than now: a sender's clock may be ahead.
+            self._reset_sent = max(self._reset_sent, min(request.sent, time.time_ns()))
         for request in self._texts(self._enters):
             self._do(request, lambda text: self.robot.enter(text) if text else None)
         self._requests += self._texts(self._steps)
         heard = [
             (received.sent, place, received)
-            for place, (_, _, _, inbox) in enumerate(self._inboxes)
+            for place, (_, channel, _, inbox) in enumerate(self._inboxes)
             for received in inbox()
-            if received.sent >= self._reset_sent  # not what was meant for the previous episode
+            # A motion may have been meant for the previous episode; a stop is always obeyed.
+            if received.sent >= self._reset_sent or channel == STATE_COMMAND
         ]
         for _, place, received in sorted(heard, key=lambda entry: entry[:2]):
             arm, channel, topic, _ = self._inboxes[place]
@@ -482,8 +484,11 @@ def _stamp_of(message: Message) -> int:
 
 def _seed(text: str) -> int:
     """Return the seed that a reset requests."""
-    if not text.isdecimal():
-        raise InputError(f"a reset's text must be a seed, a whole number; it is '{text[:40]}'.")
+    if not text.isdecimal() or len(text) > LONGEST_SEED:
+        raise InputError(
+            f"a reset's text must be a seed, a whole number of at most {LONGEST_SEED} digits; it "
+            f"is '{text[:40]}'."
+        )
     return int(text)
 
 

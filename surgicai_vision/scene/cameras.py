@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.cameras import CAMERAS
-from surgicai_vision.core.errors import InputError, UnknownName, shown
-from surgicai_vision.core.names import PSM1, PSM2
+from surgicai_vision.core.errors import InputError, UnknownName, check_name, shown
+from surgicai_vision.core.names import ARMS, PSM1, PSM2
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.rotations import matrix_to_quaternion
 
@@ -154,6 +154,9 @@ class Crop:
         distance: from the camera, along its axis, at which `span` holds [m].
         span: height of what the crop shows there [m].
         aspect: width of the whole image over its height, by default that of 640 × 480 (SurgicAI).
+
+    Raises:
+        InputError: no such arm, or a number that is not finite and above 0.
     """
 
     camera: str
@@ -161,6 +164,16 @@ class Crop:
     distance: float
     span: float
     aspect: float = 4.0 / 3.0
+
+    def __post_init__(self) -> None:
+        check_name("arm of a crop", self.arm, ARMS)
+        for attribute in ("distance", "span", "aspect"):
+            value: object = getattr(self, attribute)
+            if not isinstance(value, int | float | np.floating) or not 0.0 < value < math.inf:
+                raise InputError(
+                    f"{attribute} of the crop of {self.camera} is {shown(value)}; it must be a "
+                    "finite number above 0."
+                )
 
     def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
         """Add nothing: the camera whose image is cropped is already in the scene."""

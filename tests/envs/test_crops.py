@@ -164,6 +164,21 @@ def test_a_window_stays_within_its_image() -> None:
         assert (found.height, found.width) == (height, width)
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"arm": "psm9"}, "psm9"),
+        ({"distance": 0.0}, "distance of the crop of front is 0.0"),
+        ({"span": math.nan}, "span"),
+        ({"aspect": math.inf}, "aspect"),
+        ({"span": "0.05"}, "span"),
+    ],
+)
+def test_a_crop_that_no_camera_can_show_is_refused(changes: dict, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        Crop(**{"camera": "front", "arm": names.PSM2, "distance": 0.1, "span": 0.05, **changes})
+
+
 def test_a_crop_larger_than_its_image_is_refused() -> None:
     with pytest.raises(InputError, match="spans 200 mm does not fit"):
         whole_size(Crop("front", names.PSM2, distance=0.1, span=0.2), 0.9, *SIZE)

@@ -1,10 +1,12 @@
 """The LeRobot robot `dvrk` at a served simulation, driven by LeRobot's own functions."""
 
+import dataclasses
 import importlib.metadata
 import json
 import logging
 import math
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -236,6 +238,22 @@ def test_a_leaders_way_is_the_tips_however_fast_it_moves(robot):
     assert one._robot.told("PSM2").jaw == pytest.approx(jaw - 0.2 * JAW_OPEN, abs=0.01)
 
 
+def test_a_leaders_diagonal_comes_back_to_where_it_began(robot):
+    """In the base an increment may be longer than a step; what is cut off is not lost."""
+    one = robot(action="leader", leader={"a": "right", "b": "up", "c": "away"})
+
+    def go(*joints):
+        for _ in range(40):
+            one.send_action(dict(zip(("a.pos", "b.pos", "c.pos"), joints, strict=True)))
+        return in_view(one)
+
+    start = go(0.0, 0.0, 0.0)
+    assert np.linalg.norm(go(8.0, 8.0, 8.0) - start) > 5e-3
+    go(0.0, 8.0, 8.0)
+    go(0.0, 0.0, 8.0)
+    assert np.linalg.norm(go(0.0, 0.0, 0.0) - start) < 5e-4
+
+
 def test_two_leaders_move_both_arms(robot):
     leader = {"left_shoulder_pan": "PSM1:right", "right_shoulder_pan": "PSM2:-right"}
     one = robot(action="leader", leader=leader)
@@ -334,6 +352,27 @@ def test_an_action_that_says_nothing_usable_holds_the_arm(robot, action, problem
         one.send_action(action)
     assert one.served.robot.state("PSM2").setpoint == pytest.approx(before, abs=1e-9)
     assert problem in caplog.text
+
+
+def test_a_pose_that_cannot_be_used_leaves_the_last_observation(robot, caplog):
+    one = robot()
+    with caplog.at_level(logging.WARNING):
+        before = one.get_observation()
+        topic = topics.psm_topics("PSM2", heard=False)["local/measured_cp"]
+        heard = one._client.newest(topic.name).message
+        header = dataclasses.replace(heard.header, stamp=heard.header.stamp + 1)
+        spoilt = dataclasses.replace(heard, header=header, position=(math.nan, 0.0, 0.0))
+        one.served.publisher(topic)(spoilt)
+        assert one.get_observation() == before
+    assert "finite numbers" in caplog.text
+
+
+def test_a_judgement_of_another_sender_changes_nothing(robot):
+    one = robot()
+    text = json.dumps({"a": 1})
+    one.served.publisher(topics.JUDGEMENT)(StringStamped(Header(time.time_ns()), text))
+    assert one.get_observation()
+    assert not BOARD.success
 
 
 @pytest.mark.parametrize("command", ["pause", "disable", "fault"])

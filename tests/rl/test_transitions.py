@@ -123,6 +123,18 @@ def test_what_is_written_is_read(demos, tmp_path):
         read_transitions(tmp_path / "a.npz")
 
 
+def test_a_damaged_file_of_transitions_is_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, about=np.array("5"), reward=np.arange(2000.0))
+    content = path.read_bytes()
+    for position in range(0, len(content), 7):
+        spoilt = bytearray(content)
+        spoilt[position] ^= 0x5A
+        path.write_bytes(spoilt)
+        with pytest.raises(BadFile):
+            read_transitions(path)
+
+
 def run(demos, tmp_path, task, *options):
     folder = tmp_path / "out"
     given = ["export-demos", "--task", task, "--demos", str(demos[task]), "--out", str(folder)]

@@ -15,7 +15,7 @@ from surgicai_vision.robot import arm as arms
 from surgicai_vision.robot import frames, topics
 from surgicai_vision.robot.arm import ArmState, Endoscope, Psm
 from surgicai_vision.robot.messages import Header, JointState, PoseStamped, StringStamped
-from surgicai_vision.robot.operating_state import COMMANDS, STATES, OperatingStates
+from surgicai_vision.robot.operating_state import COMMANDS, FAULT, STATES, OperatingStates
 from surgicai_vision.robot.trajectory import Trajectory
 from surgicai_vision.scene import kinematics
 from surgicai_vision.scene.cameras import ENDOSCOPE
@@ -218,6 +218,30 @@ def test_moves_overflow_with_an_error_and_nothing_is_lost():
     with pytest.raises(InputError, match="dropped"):
         arm.receive("move_jp", joints(START), "a", NOW)
     arm.receive("servo_jp", joints(START), "a", NOW)  # a set point is always accepted
+
+
+def test_a_stop_is_obeyed_however_many_commands_are_waiting():
+    arm = psm()
+    for _ in range(arms.QUEUE):
+        arm.receive("move_jp", joints(np.add(START, [0.1, 0, 0, 0, 0, 0])), "a", NOW)
+    arm.receive("state_command", say("fault"), "b", NOW)
+    arm.advance(0.0, STATE)
+    assert arm.operating.state == FAULT and not arm.is_busy
+    assert any("rejected move_jp" in note.text for note in arm.notes)
+    for _ in range(arms.QUEUE):
+        arm.receive("state_command", say("fault"), "b", NOW)
+    with pytest.raises(InputError, match="dropped"):
+        arm.receive("state_command", say("fault"), "b", NOW)
+
+
+@pytest.mark.parametrize("commands", [("enable",), ("pause", "resume"), ("disable", "enable")])
+def test_a_motion_after_an_arm_is_enabled_again_is_obeyed(commands):
+    arm = psm()
+    for command in commands:
+        arm.receive("state_command", say(command), "a", NOW)
+    arm.receive("move_jp", joints(np.add(START, [0.1, 0, 0, 0, 0, 0])), "a", NOW)
+    arm.advance(0.0, STATE)
+    assert arm.is_busy
 
 
 def test_joints_may_come_in_any_order_or_without_names():

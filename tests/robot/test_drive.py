@@ -6,6 +6,7 @@ import json
 import math
 import os
 import pty
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from surgicai_vision.demos.imports.drive_log import import_drive_log
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
 from surgicai_vision.demos.imports.rosbag.config import Frames as BagFrames
 from surgicai_vision.demos.store import list_demos, read_demo
-from surgicai_vision.envs import poses
+from surgicai_vision.envs import contact_sheet, poses
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import ExpertAgent, RandomAgent
@@ -40,7 +41,7 @@ from surgicai_vision.robot.guards import (
     problem_of_dead_man,
     problem_of_inputs,
 )
-from surgicai_vision.robot.messages import Header, Joy, PoseStamped, StringStamped
+from surgicai_vision.robot.messages import CompressedImage, Header, Joy, PoseStamped, StringStamped
 from surgicai_vision.robot.server import ServeConfig, Server
 from surgicai_vision.robot.transport import RenamedTransport
 from surgicai_vision.scene import kinematics
@@ -299,6 +300,33 @@ def test_images_reach_the_agent_as_they_were_rendered():
     assert script.seen[0]["front"].shape == (64, 64, 3)
     assert script.seen[0]["front"].std() > 5
     assert np.array_equal(script.seen[0]["agent_pos"].shape, (7,))
+
+
+def compressed(*shape):
+    return contact_sheet.png(np.arange(np.prod(shape), dtype=np.uint8).reshape(shape))
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"", "cannot be read"),
+        (b"no image", "cannot be read"),
+        (compressed(8, 8, 3)[:40], "cannot be read"),
+        (compressed(16, 8, 3), "16 × 8"),
+    ],
+)
+def test_a_compressed_image_that_cannot_be_used_is_refused(content, problem):
+    shown = [content]
+    client = SimpleNamespace(
+        image_topic=str,
+        newest=lambda _: SimpleNamespace(message=CompressedImage(Header(), "png", shown[0])),
+    )
+    robot = DrivenRobot(client, ("front",), "grasp", 8)
+    with pytest.raises(InputError, match=problem):
+        robot.images()
+    shown[0] = compressed(8, 8, 3)
+    frame = robot.images()["front"]
+    assert np.array_equal(frame, np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3))
 
 
 def test_a_dry_run_tells_and_moves_nothing():

@@ -258,6 +258,22 @@ def test_what_was_sent_before_a_reset_is_not_obeyed_after_it():
     assert client.robot.state("PSM2").jaw_setpoint < 0.8
 
 
+def test_a_stop_sent_before_a_reset_is_obeyed_after_it():
+    client = Client()
+    client.say("/PSM2/state_command", StringStamped(Header(), "fault"))
+    client.say("/simulation/reset", StringStamped(Header(70), str(SEED)))
+    said = client.step()
+    assert said["/PSM2/operating_state"][-1].state == "FAULT"
+
+
+@pytest.mark.parametrize("text", ["", "-1", "1.5", "seed", "9" * 5000])
+def test_a_reset_to_no_seed_is_answered_and_the_server_goes_on(text):
+    client = Client()
+    client.say("/simulation/reset", StringStamped(Header(70), text))
+    answers = [said.text for said in client.step()["/simulation/stepped"]]
+    assert any(answer.startswith("70 a reset's text must be a seed") for answer in answers)
+
+
 def test_a_request_that_comes_twice_is_met_once(client):
     """A client repeats a request that got no answer; without a stamp every request is new."""
     before = client.robot.steps
