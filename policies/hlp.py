@@ -108,8 +108,8 @@ class HighLevelPolicy(Policy):
 
     def calibrate(self, answers: torch.Tensor, target: torch.Tensor) -> None:
         """Set the temperature that maximises the likelihood of held-out frames' subtasks."""
-        logits = answers[:, :CLASSES].double() * self.temperature
-        fitted = fit_temperature(logits.cpu().numpy(), target[:, 0].long().cpu().numpy())
+        logits = answers[:, :CLASSES].cpu().double() * self.temperature.cpu()
+        fitted = fit_temperature(logits.numpy(), target[:, 0].long().cpu().numpy())
         self.temperature.fill_(fitted)
 
     def choose(

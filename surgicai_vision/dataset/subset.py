@@ -79,9 +79,10 @@ def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
     """Return a subtask's frames of a dataset of whole procedures, as a dataset of that subtask.
 
     The task of its configuration is the subtask, with the subtask's step limit. `frame_index` and
-    `timestamp` count from the beginning of each visit, a run of frames of one phase in one episode.
-    A procedure that returns to a subtask (`demos.recovery_expert`) visits it more than once, and
-    the policy then restarts its clock.
+    `timestamp` count from the beginning of each visit, a run of frames of one phase in one episode
+    of the whole dataset, also if `dataset` has only some of its frames. A procedure that returns to
+    a subtask (`demos.recovery_expert`) visits it more than once, and the policy then restarts its
+    clock.
 
     Raises:
         UnknownName: no subtask of that name.
@@ -99,18 +100,35 @@ def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
         raise InputError(f"The dataset holds no frame of '{subtask}'.")
     limit = TaskConfig(subtask).max_steps
     config = replace(dataset.config, task=subtask, max_steps=limit)
-    return DatasetSubset(dataset, rows, {"subtask": subtask}, config=config, restart_time=True)
+    since = _since_visit(dataset, rows)
+    return DatasetSubset(dataset, rows, {"subtask": subtask}, config=config, added=since)
 
 
-def first_of_visit(rows: NDArray[np.int64], episode_index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for every selected row the position of the first row of its visit, (N,) int64.
+def _since_visit(dataset: Dataset, rows: NDArray[np.int64]) -> dict[str, NDArray[np.generic]]:
+    """Return `frame_index` and `timestamp` of some rows, counted from their visit's beginning."""
+    whole, places = dataset, rows
+    while isinstance(whole, DatasetSubset):
+        places = whole.rows[places]
+        whole = whole.whole
+    columns = whole.columns()
+    first = first_of_visit(np.asarray(columns[names.PHASE]), np.asarray(whole.episode_index))
+    return {
+        key: np.subtract(columns[key][places], columns[key][first[places]])
+        for key in ("frame_index", "timestamp")
+    }
+
+
+def first_of_visit(
+    phase: NDArray[np.generic], episode_index: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return for every frame the position of the first frame of its visit, (N,) int64.
 
     Args:
-        rows: (N,) int64, ascending: which frames of the whole are selected.
-        episode_index: (N,) their episodes. A visit is a run of neighbouring rows of one episode.
+        phase: (N,) phase of every frame.
+        episode_index: (N,) their episodes. A visit is a run of frames of one phase and episode.
     """
-    begins = np.ones(len(rows), dtype=bool)
-    begins[1:] = (np.diff(rows) != 1) | (np.diff(episode_index) != 0)
+    begins = np.ones(len(phase), dtype=bool)
+    begins[1:] = (phase[1:] != phase[:-1]) | (np.diff(episode_index) != 0)
     first: NDArray[np.int64] = np.flatnonzero(begins)[np.cumsum(begins) - 1]
     return first
 
@@ -137,7 +155,6 @@ class DatasetSubset:
         *,
         config: TaskConfig | None = None,
         fps: int | None = None,
-        restart_time: bool = False,
         added: Mapping[str, NDArray[np.generic]] | None = None,
     ):
         """Select `rows` of `whole`.
@@ -148,14 +165,11 @@ class DatasetSubset:
             selection: describes the selected frames as plain data; part of the fingerprint.
             config: configuration of the task; the whole's by default.
             fps: frames per second; the whole's by default.
-            restart_time: restart `frame_index` and `timestamp` in every run of neighbouring rows
-                of one episode.
-            added: columns that the whole does not have, (N,) or (N, n); `selection` must describe
-                them.
+            added: columns that the whole does not have, or has with other values, (N,) or (N, n);
+                `selection` must describe them.
         """
         self.whole = whole
         self._selection = dict(selection)
-        self._restart_time = restart_time
         self._added = dict(added or {})
         self.rows = rows
         self.path: Path = whole.path
@@ -189,10 +203,6 @@ class DatasetSubset:
     def columns(self) -> dict[str, NDArray[np.generic]]:
         """Return every column that is not an image, (N,) or (N, n), by its key."""
         columns = {key: values[self.rows] for key, values in self.whole.columns().items()}
-        if self._restart_time:
-            first = first_of_visit(self.rows, self.episode_index)
-            for key in ("frame_index", "timestamp"):
-                columns[key] = np.subtract(columns[key], columns[key][first])
         return columns | self._added
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:

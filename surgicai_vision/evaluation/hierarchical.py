@@ -122,17 +122,19 @@ class _LearnedEnds:
 
     Args:
         config: `confidence`, `patience` and `decide_every`.
+        action_repeat: control steps for which an action is held.
     """
 
-    def __init__(self, config: HierarchicalConfig):
+    def __init__(self, config: HierarchicalConfig, action_repeat: int):
         self._config = config
+        self._action_repeat = action_repeat
 
     def advance(self, state: _EpisodeState, robot: Robot) -> None:
         """Nothing to advance: no measurement ends a subtask."""
 
     def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
-        """Return True every `decide_every` steps."""
-        return state.steps % self._config.decide_every == 0
+        """Return True every `decide_every` control steps, or at the next action after them."""
+        return state.steps % self._config.decide_every < self._action_repeat
 
     def believes(self, state: _EpisodeState, choice: _Choice) -> bool:
         """Return True once the same other subtask has been named often enough in a row."""
@@ -188,6 +190,7 @@ class HierarchicalAgent(Agent):
         config: when a subtask ends.
         low: makes the low-level policies, in the order of the subtasks.
         high: makes the high-level policy; None takes the subtasks in their order.
+        action_repeat: control steps for which an action is held.
     """
 
     name = "hierarchical"
@@ -197,12 +200,16 @@ class HierarchicalAgent(Agent):
         config: HierarchicalConfig,
         low: Sequence[MakeAgent],
         high: Callable[[], PolicyAgent] | None = None,
+        action_repeat: int = 1,
     ):
         self.config = config
+        self._action_repeat = action_repeat
         self._low = [make() for make in low]
         self._high = high() if high is not None else None
         learned = config.termination == "learned"
-        self._ends: _Ends = _LearnedEnds(config) if learned else _PrivilegedEnds(config.grasp_hold)
+        self._ends: _Ends = (
+            _LearnedEnds(config, action_repeat) if learned else _PrivilegedEnds(config.grasp_hold)
+        )
         self._agents = [*self._low, *([self._high] if self._high else [])]
         self.privileged = not learned or any(agent.privileged for agent in self._agents)
         self.cameras, self.image_size = common_images(self._agents)
@@ -239,7 +246,7 @@ class HierarchicalAgent(Agent):
                     [observations[row] for row in rows],
                 )
         for state in states:
-            state.steps += 1
+            state.steps += self._action_repeat
         return actions
 
     def _may_act(self, state: _EpisodeState) -> bool:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
-from surgicai_vision.core.config import TaskConfig, from_mapping
+from surgicai_vision.core.config import TaskConfig, digest, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
 from surgicai_vision.dataset import open_h
@@ -61,6 +61,8 @@ if TYPE_CHECKING:
     from encoders.base import Encoder
 
 CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
+PROCESSORS = "policy_*processor*"
+"""Files of the processing around a policy: its steps and their normalisers."""
 PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")
 """Where a checkpoint may be in a folder that the user names."""
 ENV_TYPE = "surgicai"
@@ -135,6 +137,7 @@ class LeRobotCheckpoint:
         inputs: what it sees.
         encoder: the frozen encoder, ours or the policy's own; None for a policy without images.
         policy_sha256: hash of its weights.
+        settings_sha256: hash of its settings and normalisers, which decide how the weights act.
     """
 
     policy: str
@@ -142,6 +145,7 @@ class LeRobotCheckpoint:
     inputs: Inputs
     encoder: str | None
     policy_sha256: str
+    settings_sha256: str
 
 
 def read(folder: Path, task: str | None = None) -> LeRobotCheckpoint:
@@ -160,8 +164,15 @@ def read(folder: Path, task: str | None = None) -> LeRobotCheckpoint:
     config, inputs = _circumstances(training, folder, task, policy)
     named = inputs.encoder or policy.get("encoder")
     encoder = (named or OWN) if inputs.cameras else None
-    sha256 = sha256_file(folder / WEIGHTS)
-    return LeRobotCheckpoint(str(policy["type"]), config, inputs, encoder, sha256)
+    settings = sorted([folder / CONFIG, *folder.glob(PROCESSORS)])
+    return LeRobotCheckpoint(
+        str(policy["type"]),
+        config,
+        inputs,
+        encoder,
+        policy_sha256=sha256_file(folder / WEIGHTS),
+        settings_sha256=digest({path.name: sha256_file(path) for path in settings}),
+    )
 
 
 def _circumstances(

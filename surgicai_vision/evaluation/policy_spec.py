@@ -313,10 +313,13 @@ def _from_folder(
         lerobot_agent.LeRobotAgent, run.name, lerobot, known.inputs, text, weights
     )
     about: dict[str, JSON] = {
-        "checkpoint": {"policy_sha256": known.policy_sha256},
+        "checkpoint": {
+            "policy_sha256": known.policy_sha256,
+            "settings_sha256": known.settings_sha256,
+        },
         "folder": str(lerobot),
     }
-    return PolicySpec(run, make, about, known.policy_sha256[:8])
+    return PolicySpec(run, make, about, digest(about["checkpoint"])[:8])
 
 
 def _from_checkpoint(folder: Path, weights: WeightsSource, changes: tuple[str, ...]) -> PolicySpec:
@@ -358,6 +361,7 @@ def _hashes(checkpoint: Checkpoint) -> dict[str, JSON]:
         "weights_sha256": encoder.weights_sha256 if encoder else None,
         "policy_sha256": checkpoint.policy_sha256,
         "dataset": checkpoint.dataset,
+        "recipe": digest(checkpoint.recipe),
     }
 
 
@@ -482,7 +486,9 @@ def hierarchical_policy(
         parts=digest(config),
         expert_swap=expert_swap,
     )
-    make = functools.partial(HierarchicalAgent, config, tuple(agents.values()), high)
+    make = functools.partial(
+        HierarchicalAgent, config, tuple(agents.values()), high, env.action_repeat
+    )
     return PolicySpec(run, make, about)
 
 

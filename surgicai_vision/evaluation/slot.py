@@ -169,7 +169,8 @@ class Slot:
                 self.watch.update(self.info)
         if self.info.get("physics_error"):
             self.error, self.diverged = self.error or "the physics diverged", True
-        self.steps += self.task_config.action_repeat
+        # A step in which the physics diverged counts too, though the env does not count it.
+        self.steps = max(self.steps + 1, self.env.simulation.task_state.steps)
         self.touched = self.touched or bool(self.info.get("contact"))
         self.ended = bool(
             terminated or truncated or self.error or self.steps >= self.task_config.max_steps

@@ -65,6 +65,12 @@ class Quickstart:
         check_frame_stride(self.frame_stride)
         if not 0.0 <= self.noise <= 1.0:
             raise InputError(f"noise is {self.noise:g}; it must be between 0 and 1.")
+        names = [run.name for run in self.runs]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(
+                    f"policies: two are called '{name}'; recipes of files need different names."
+                )
         for run in self.runs:
             if run.encoder:
                 encoders.check_encoder_name(run.encoder)

@@ -4,7 +4,6 @@ import itertools
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from surgicai_vision.core.banks import HELD_OUT
 from surgicai_vision.core.cameras import view_names
@@ -39,7 +38,7 @@ class Condition:
         hierarchical: how subtasks end under a hierarchical policy, or "".
         trained_by: the policy's kind.
         pool: what is taken from the encoder.
-        recipe: the recipe's name.
+        recipe: the recipe's name, or the path of its file.
         changes: what is changed in the recipe.
         acted_by: what is changed in the recipe for the evaluation only.
         demonstrations: demonstrations trained on, validation included; None if not known.
@@ -48,6 +47,7 @@ class Condition:
         dagger_rounds: rounds of DAgger that those include.
         demonstrator: who demonstrated; "" if not known.
         noise: strength of the disturbance of the demonstrator's executed actions.
+        post_success_steps: control steps that demonstrations continue after their success.
         budget: updates or control steps that the training was given, or "".
         world: what differs from the usual in the world of the evaluation, before a shift; "" if
             nothing does.
@@ -81,6 +81,7 @@ class Condition:
     dagger_rounds: int = 0
     demonstrator: str = ""
     noise: float = 0.0
+    post_success_steps: int = 0
     budget: str = ""
     world: str = ""
     recorded_in: str = ""
@@ -140,6 +141,7 @@ class Condition:
             "" if self.demonstrations is None else f"{self.demonstrations} demonstrations",
             f"demonstrated by {self.demonstrator}" if self.demonstrator else "",
             f"noise {self.noise:g}",
+            f"{self.post_success_steps} steps after each success",
             self.budget,
             f"in {self.world or USUAL}",
             f"with {self.rules}" if self.rules else "",
@@ -221,7 +223,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         hierarchical=run.termination or "",
         trained_by=(run.algo or run.policy) if run.is_trained else Condition.trained_by,
         pool=run.pool,
-        recipe=Path(run.recipe).stem,
+        recipe=run.recipe,
         changes=run.changes,
         acted_by=run.acted_by,
         demonstrations=run.demonstrations,
@@ -230,6 +232,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         dagger_rounds=run.dagger_rounds,
         demonstrator=run.demonstrator or "",
         noise=run.noise,
+        post_success_steps=run.post_success_steps,
         budget=_budget(run),
         **_worlds(run),
         rules=_rules(run),
@@ -265,7 +268,8 @@ def _budget(run: RunConfig) -> str:
     between training seeds.
     """
     if run.updates is not None:
-        return f"{run.updates:,} updates"
+        frames = f" of {run.batch_size} frames" if run.batch_size else ""
+        return f"{run.updates:,} updates{frames}"
     return f"{run.env_steps:,} control steps" if run.env_steps and run.algo in ALGORITHMS else ""
 
 

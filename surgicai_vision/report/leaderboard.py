@@ -30,7 +30,7 @@ from surgicai_vision.core import percentages
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_at_least, check_finite
 from surgicai_vision.core.files import write_bytes, write_json
-from surgicai_vision.core.names import TEST_SEED
+from surgicai_vision.core.names import SUTURE, TEST_SEED
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS, advance_of
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
@@ -218,6 +218,10 @@ def problem(row: Row) -> str:
         return f"its env differs from the task's in {', '.join(names)}."
     if row.run.upset:
         return "its episodes were upset on purpose (upset)."
+    if row.run.is_hierarchical and row.run.task != SUTURE:
+        return f"it is a hierarchical policy of {row.run.task}, which is one subtask."
+    if row.run.expert_swap is not None:
+        return f"the expert acts in its {row.run.expert_swap} (expert_swap)."
     present = build_scene(env.scene).hash
     if row.scene_hash != present:
         return f"its scene {row.scene_hash[:12]} is not the present one, {present[:12]}."
@@ -226,6 +230,8 @@ def problem(row: Row) -> str:
         return f"it has {count} starts, {len(row.successes)} outcomes and {len(row.steps)} lengths."
     if count < FEWEST or row.seeds != tuple(range(TEST_SEED, TEST_SEED + count)):
         return f"its starts are not {FEWEST} or more in a row from {TEST_SEED} on."
+    if row.run.starts is not None and row.run.starts.seeds != range(TEST_SEED, TEST_SEED + count):
+        return "its run names other starts than its outcomes are of."
     if not all(0 < steps <= env.max_steps for steps in row.steps):
         return f"an episode has no steps, or more than the task's {env.max_steps}."
     return ""

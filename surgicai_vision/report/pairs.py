@@ -41,6 +41,7 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "dagger_rounds": "rounds of DAgger",
         "demonstrator": "demonstrator",
         "noise": "noise of the demonstrations",
+        "post_success_steps": "steps after success",
         "budget": "budget",
         "world": "world",
         "learned_in": "world of the demonstrations",
@@ -52,7 +53,7 @@ FACTORS: Mapping[str, str] = MappingProxyType(
 """Attribute of a condition → the name of a difference in it."""
 AMOUNTS = ("demonstrations", "looks", "multiplied_from", "dagger_rounds")
 """Fields that say how much there was to learn from."""
-DEMONSTRATED = ("demonstrations", "demonstrator", "noise")
+DEMONSTRATED = ("demonstrations", "demonstrator", "noise", "post_success_steps")
 """Fields that say what was demonstrated, by whom and how."""
 OF_RECIPES = ("encoder", "views", "pool", "changes", "budget", *DEMONSTRATED)
 OF_KINDS = ("recipe", "changes")

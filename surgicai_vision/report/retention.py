@@ -7,8 +7,9 @@ its interval. `looks(groups)` puts a policy's evaluation in looks for training n
 held-out looks.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from markupsafe import Markup
 
@@ -172,10 +173,11 @@ def _row(row: Kept) -> tuple[str, ...]:
 def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
     """Return task, policy, counts in held-in and in held-out looks, and what is kept, as text.
 
-    A policy has a row if it was evaluated in both. The two evaluations may differ in where they are
-    stored, the name of the condition and the looks; their worlds vary alike in all else.
+    A policy has a row if it was evaluated in both; with several looks of either kind, a row for
+    each two of them, which names them. The two evaluations may differ in where they are stored, the
+    name of the condition and the looks; their worlds vary alike in all else.
     """
-    seen: dict[tuple[Condition, str, RandomisationConfig], dict[bool, list[Result]]] = {}
+    seen: dict[tuple[Condition, str, RandomisationConfig], _ByLook] = {}
     for item in groups:
         if not (item.episodes and item.condition.plain and item.condition.trained):
             continue
@@ -184,16 +186,33 @@ def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
             axes = result.config.randomisation
             if axes.appearance in (names.TRAIN, *names.TRAIN_APPEARANCES) or axes.shows_heldout:
                 world = replace(axes, appearance="", appearance_shift=0.0)
-                by_look = seen.setdefault((known, item.condition.learned_in, world), {})
-                by_look.setdefault(axes.shows_heldout, []).append(result)
+                by_look = seen.setdefault((known, item.condition.learned_in, world), _ByLook())
+                kind = by_look.held_out if axes.shows_heldout else by_look.held_in
+                kind.setdefault(_look(axes), []).append(result)
     label_of = labels({known for known, _, _ in seen})
     rows: list[tuple[str, ...]] = []
     for (known, _, _), by_look in seen.items():
-        if len(by_look) == 2:
-            held_in, held_out = _wins(by_look[False]), _wins(by_look[True])
+        pairs = list(itertools.product(by_look.held_in.items(), by_look.held_out.items()))
+        for (one, seen_in), (other, seen_out) in pairs:
+            held_in, held_out = _wins(seen_in), _wins(seen_out)
             counts = _count(held_in), _count(held_out), _ratio(held_in, held_out)
-            rows.append((known.task, label_of[known], *counts))
+            looks_shown = f", {one} and {other}" if len(pairs) > 1 else ""
+            rows.append((known.task, label_of[known] + looks_shown, *counts))
     return rows
+
+
+@dataclass
+class _ByLook:
+    """Results of one policy: the looks (`_look`) of each kind → their results."""
+
+    held_in: dict[str, list[Result]] = field(default_factory=dict)
+    held_out: dict[str, list[Result]] = field(default_factory=dict)
+
+
+def _look(axes: RandomisationConfig) -> str:
+    """Return the looks that the episodes of an evaluation have, in words."""
+    shifted = f"shifted by {axes.appearance_shift:g}" if axes.appearance_shift else ""
+    return " ".join(filter(None, (axes.appearance, shifted)))
 
 
 def _count(wins: Mapping[Start, bool]) -> str:

@@ -137,7 +137,8 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
         env.enter(subtask)
         terminated = truncated = False
         info: dict[str, Any] = {}
-        for _ in range(self.config.steps):
+        repeat = env.config.action_repeat
+        for _ in range(-(-self.config.steps // repeat)):
             move = agent.act([0], [env], [self._observation])[0]
             if not np.isfinite(move).all():
                 truncated = True
@@ -147,7 +148,7 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
             except PhysicsError:
                 truncated = True
                 break
-            self.control_steps += 1
+            self.control_steps += repeat
             if terminated or truncated:
                 break
             leave_held_grasp(env, subtask, self.config.grasp_hold)

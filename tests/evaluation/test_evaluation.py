@@ -382,6 +382,12 @@ def test_expert_solves_held_out_starts():
     assert all(row.success for row in rows), rows
 
 
+@pytest.mark.parametrize(("action_repeat", "limit"), [(1, 4), (2, 5), (3, 10)])
+def test_steps_are_control_steps_however_long_an_action_is_held(action_repeat, limit):
+    config = TaskConfig("grasp", max_steps=limit, action_repeat=action_repeat)
+    assert evaluate(ZeroAgent, config, [names.TEST_SEED], workers=1)[0].row.steps == limit
+
+
 def test_zero_fails():
     row = evaluate(ZeroAgent, SHORT, [names.TEST_SEED], workers=1)[0].row
     assert (row.success, row.failure, row.steps) == (False, "missed", SHORT.max_steps)

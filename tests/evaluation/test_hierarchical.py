@@ -96,12 +96,15 @@ class Saying:
         return np.concatenate([logits, progress], axis=1).astype(np.float32)
 
 
-def agent(classes: list[int], sure: float = 0.9, **changes: object) -> HierarchicalAgent:
+def agent(
+    classes: list[int], sure: float = 0.9, action_repeat: int = 1, **changes: object
+) -> HierarchicalAgent:
     """Return a policy whose high level names `classes` in turn; each low level plays its index."""
     made = HierarchicalAgent(
         HierarchicalConfig("hlp", **{**PRIVILEGED, **changes}),
         [ExpertAgent] * 5,
         lambda: Saying(classes, sure),
+        action_repeat,
     )
     made._low = [Constant(index / 10) for index in range(5)]
     return made
@@ -122,6 +125,20 @@ def roll(actor: HierarchicalAgent, env: Env, steps: int) -> list[int]:
         acted.append(round(10 * float(value)))
         env.step()
     return acted
+
+
+@pytest.mark.parametrize(
+    ("held", "acted"), [(1, [0, 0, 0, 0, 1, 1, 1, 1, 2]), (2, [0, 0, 1, 1, 2]), (5, [0, 1, 2])]
+)
+def test_a_high_level_policy_is_asked_by_control_steps(held: int, acted: list[int]) -> None:
+    actor = learned([0, 1, 2], decide_every=4, action_repeat=held)
+    assert roll(actor, Env(99), len(acted)) == acted
+
+
+@pytest.mark.parametrize(("held", "acted"), [(1, [0, 0, 0, 0, 1]), (2, [0, 0, 1]), (3, [0, 0, 1])])
+def test_a_subtasks_limit_counts_control_steps(held: int, acted: list[int]) -> None:
+    actor = agent([0, 1], steps=4, action_repeat=held)
+    assert roll(actor, Env(99), len(acted)) == acted
 
 
 def test_privileged_termination_asks_when_the_subtask_has_ended() -> None:
@@ -240,6 +257,18 @@ def test_trained_policies_act_together_in_any_batch(tmp_path: Path) -> None:
     assert (spec.config.advance, spec.config.reward) == ("told", "dense")
     with pytest.raises(InputError, match="follows from the termination"):
         open_policy(written(tmp_path, hlp, low), env={"advance": "success"})
+
+
+def test_a_part_by_another_recipe_is_another_policy(tmp_path: Path) -> None:
+    """How a plan is acted out is a setting of the recipe; the weights are the same."""
+    place = checkpoint(tmp_path / "place", "place")
+    config = HierarchicalConfig("order", **{**PRIVILEGED, "place": place})
+    before = hierarchical_policy(config).about
+    card = read_checkpoint(Path(place))
+    changed = replace(card, recipe={**card.recipe, "epochs": 99})
+    write_checkpoint(Path(place), changed, read_tensors(card))
+    assert read_checkpoint(Path(place)).policy_sha256 == card.policy_sha256
+    assert hierarchical_policy(config).about != before
 
 
 def test_policies_may_have_learned_in_worlds_that_vary_and_not_in_different_scenes(

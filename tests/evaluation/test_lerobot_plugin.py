@@ -245,6 +245,20 @@ def test_defaults_are_the_recipe_paper() -> None:
     assert SurgicaiBcConfig(device="cpu").recipe() == policies.load_recipe("bc", "paper")
 
 
+@pytest.mark.parametrize("changed", ["config.json", "policy_preprocessor.json"])
+def test_a_checkpoint_that_acts_otherwise_is_another_policy(
+    changed: str, trained: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(trained / CHECKPOINT, other)
+    specs = [open_policy(other)]
+    table = json.loads((other / changed).read_text())
+    (other / changed).write_text(json.dumps({**table, "told": "otherwise"}))
+    specs.append(open_policy(other))
+    assert specs[0].content != specs[1].content
+    assert specs[0].folder_name != specs[1].folder_name
+
+
 def test_checkpoint_names_the_encoder_and_holds_none_of_it(trained: Path) -> None:
     from safetensors.torch import load_file
 

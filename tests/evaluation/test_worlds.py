@@ -15,7 +15,7 @@ from surgicai_vision.core.config import (
 )
 from surgicai_vision.evaluation.policy_spec import PolicySpec, in_env
 from surgicai_vision.evaluation.robustness import shifted
-from surgicai_vision.report.experiment_key import USUAL, condition_of
+from surgicai_vision.report.experiment_key import USUAL, condition_of, labels
 from surgicai_vision.report.pairs import factor
 from surgicai_vision.training.run_config import RunConfig, evaluated_in, of_training
 
@@ -55,6 +55,21 @@ def test_policies_of_two_worlds_are_told_apart_where_they_meet():
     assert here.recorded_in == USUAL and not there.recorded_in
     assert factor(here, there) == "world of the demonstrations"
     assert USUAL in here.label and "phantom_shift 10" in there.label
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference"),
+    [
+        ({"post_success_steps": 20}, "steps after success"),
+        ({"recipe": "mine/paper.yaml"}, "recipe"),
+        ({"updates": 2000, "batch_size": 64}, "budget"),
+    ],
+)
+def test_what_was_taught_otherwise_is_another_condition(changes, difference):
+    run = replace(trained(STANDING), updates=changes.get("updates"), batch_size=8)
+    one, other = condition_of(run), condition_of(replace(run, **changes))
+    assert factor(one, other) == difference
+    assert len(set(labels([one, other]).values())) == 2
 
 
 def test_one_policy_in_two_worlds_is_paired_and_two_policies_in_two_worlds_are_not():

@@ -16,7 +16,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.video import read_video
 from surgicai_vision.experiments.quickstart import run_quickstart
-from surgicai_vision.experiments.quickstart_config import Quickstart
+from surgicai_vision.experiments.quickstart_config import PolicyChoice, Quickstart
 
 TINY = {
     "task": "grasp",
@@ -75,6 +75,13 @@ def run(folder, *arguments):
 def test_a_quickstart_without_policies_is_refused():
     with pytest.raises(InputError, match="policies is empty; give at least one"):
         Quickstart(policies=())
+
+
+def test_policies_of_one_name_are_refused():
+    """Each has a folder of its name: the second would be taken for the first."""
+    two = (PolicyChoice(recipe="paper"), PolicyChoice(recipe="mine/paper.yaml"))
+    with pytest.raises(InputError, match="two are called 'proprioception'"):
+        Quickstart(policies=two)
 
 
 def test_images_that_cannot_be_rendered_are_refused_before_any_work(tmp_path):

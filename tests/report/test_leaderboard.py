@@ -79,6 +79,16 @@ SPOILS: dict[str, Callable[[Row], Row]] = {
     "shifted": lambda row: replace(row, run=replace(row.run, shift=Shift("camera", 0.5))).sealed(),
     "randomisation": lambda row: replace(row, run=replace(row.run, shift=Shift(ALL, 0.5))).sealed(),
     "upset": lambda row: replace(row, run=replace(row.run, upset=True)).sealed(),
+    "other starts": lambda row: replace(row, run=replace(row.run, starts=Starts(0))).sealed(),
+    "expert acts": lambda row: replace(row, run=replace(row.run, expert_swap="grasp")).sealed(),
+    "one subtask": lambda row: replace(
+        row,
+        run=replace(
+            row.run,
+            env=replace(row.run.env, max_steps=MAX_STEPS, advance="told"),
+            termination="learned",
+        ),
+    ).sealed(),
 }
 
 

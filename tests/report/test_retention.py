@@ -70,6 +70,23 @@ def test_held_out_looks_stand_beside_those_for_training(folder):
     assert kept.startswith(f"{100 * second / first:.0f} %")
 
 
+def test_each_family_of_held_out_looks_has_its_own_row(tmp_path):
+    generator = np.random.default_rng(5)
+    shown = {
+        look: TaskConfig("insert", randomisation=RandomisationConfig(appearance=look))
+        for look in (names.TRAIN, *names.HELDOUT_APPEARANCES)
+    }
+    trained = replace(run_of("insert", "imagenet", ("back",), 0), env=shown[names.TRAIN])
+    for place, (look, env) in enumerate(shown.items()):
+        run = evaluated_in(trained, env)
+        rate = -0.5 if place == 1 else 1.5  # the first held-out family fails everywhere
+        evaluation(tmp_path / look, run, rate, generator, {"checkpoint": CHECKPOINT})
+    rows = looks(group(collect(tmp_path)))
+    held_out = {row[1].split(" and ")[-1]: row[3].split("/")[0] for row in rows}
+    first, *others = names.HELDOUT_APPEARANCES
+    assert held_out == {first: "0", **dict.fromkeys(others, "20")}
+
+
 def test_policies_that_differ_in_their_demonstrations_are_told_apart(tmp_path):
     generator = np.random.default_rng(5)
     about = {"checkpoint": CHECKPOINT}

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_dataset import features_of, recorded
+from fake_dataset import fake_procedures, features_of, recorded
 from photographs import hopper
 from tiny_encoder import TINY
 
@@ -18,8 +18,14 @@ from surgicai_vision.training.train import train
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
 
-RECIPES = {"bc": "endoscope", "act": "act", "diffusion": "diffusion", "vqbet": "vqbet"}
-"""A recipe of each kind of low-level policy."""
+RECIPES = {
+    "bc": "endoscope",
+    "act": "act",
+    "diffusion": "diffusion",
+    "vqbet": "vqbet",
+    "hlp": "high-level",
+}
+"""A recipe of each kind of policy."""
 
 
 def train_small(policy: str, out: Path, device: str, stop_after: int = 0) -> None:
@@ -31,7 +37,7 @@ def train_small(policy: str, out: Path, device: str, stop_after: int = 0) -> Non
 
     recipe = load_recipe(policy, RECIPES[policy], {"epochs": 7, "batch_size": 64, "map_shift": 1})
     plugin = policy_plugin(policy)
-    whole = recorded()
+    whole = fake_procedures() if policy == "hlp" else recorded()
     dataset: Dataset = whole
     if plugin.offsets:
         dataset = with_chunks(whole, timeline_of(whole), plugin.offsets(recipe))

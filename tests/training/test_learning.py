@@ -9,7 +9,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_dataset import FakeData
+from fake_dataset import FakeData, fake_procedures
 
 from encoders.base import POOLS
 from surgicai_vision.commands import folders, logs
@@ -211,9 +211,9 @@ def test_a_low_level_policy_is_warned_of_what_teaches_a_high_level_one(
 
 def test_a_subtasks_time_counts_from_the_beginning_of_each_visit() -> None:
     """For an episode that visits a subtask twice, and for two that end and begin with it."""
-    rows = np.array([3, 4, 5, 9, 10, 20, 21, 22])
+    phases = np.array([2, 2, 2, 0, 2, 2, 2, 2])
     episode = np.array([0, 0, 0, 0, 0, 0, 1, 1])
-    assert first_of_visit(rows, episode).tolist() == [0, 0, 0, 3, 3, 5, 6, 6]
+    assert first_of_visit(phases, episode).tolist() == [0, 0, 0, 3, 4, 4, 6, 6]
     whole = Dataset()
     phase = whole.columns()[names.PHASE]
     once = of_subtask(whole, "insert").columns()
@@ -224,6 +224,17 @@ def test_a_subtasks_time_counts_from_the_beginning_of_each_visit() -> None:
     np.testing.assert_array_equal(once["frame_index"], index - index[first])
     seconds = whole.columns()["timestamp"][kept]
     np.testing.assert_array_equal(once["timestamp"], seconds - seconds[first])
+
+
+def test_a_subtasks_time_does_not_depend_on_which_frames_are_kept() -> None:
+    """An insertion begins between two frames of a stride: its clock began then all the same."""
+    whole = fake_procedures(episodes=2, steps=13)
+    began = [26, 65 + 26]
+    strided = of_subtask(with_frame_stride(whole, 5), "insert")
+    kept = np.flatnonzero(np.isin(np.arange(whole.length) % 65, [30, 35]))
+    since = kept - np.repeat(began, 2)
+    assert strided.columns()["frame_index"].tolist() == since.tolist() == [4, 9, 4, 9]
+    np.testing.assert_allclose(strided.columns()["timestamp"], since / names.FPS, atol=1e-6)
 
 
 def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(

@@ -11,12 +11,14 @@ from fake_hub import FakeHub
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.commands.policy import push
-from surgicai_vision.core.config import SceneConfig, to_mapping
+from surgicai_vision.core import names
+from surgicai_vision.core.config import SceneConfig, TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
 from surgicai_vision.evaluation.storage import FORMAT
 from surgicai_vision.scene import build_scene
-from surgicai_vision.training.checkpoint import CARD, WEIGHTS, read_checkpoint
+from surgicai_vision.training.checkpoint import CARD, WEIGHTS, Checkpoint, read_checkpoint
 from surgicai_vision.training.hub import Successes, model_card, pull_policy, push_policy
+from surgicai_vision.training.run_config import Shift
 
 REPO = "somebody/suturing-grasp-bc"
 SUCCESSES = Successes(count=18, episodes=20, interval=(0.683, 0.988), seeds=tuple(range(7, 27)))
@@ -136,22 +138,62 @@ def test_the_commands_show_the_card_and_say_when_offline(
     assert "--repo USER/NAME" in capsys.readouterr().err
 
 
-def test_successes_are_those_of_this_policy(
-    tmp_path: Path, policy: Path, monkeypatch: pytest.MonkeyPatch
+def write_stored(folder: Path, trained: Checkpoint, **changes: object) -> None:
+    """Write the marker of an evaluation of a policy, whose run is changed."""
+    counts = {"successes": 1, "episodes": 2, "ci95": [0.01, 0.99]}
+    stored = {
+        "format": FORMAT,
+        "run": to_mapping(replace(trained.run, **changes)),
+        "summary": {"task": "grasp", "policy": "mine", **counts},
+        "about": {"checkpoint": {"policy_sha256": trained.policy_sha256}},
+    }
+    (folder / "evaluation.json").write_text(json.dumps(stored))
+
+
+@pytest.fixture
+def seeds(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Seeds of the starts that an evaluation is read to have."""
+    found = [names.TEST_SEED, names.TEST_SEED + 1]
+    monkeypatch.setattr(
+        "surgicai_vision.evaluation.storage.read_rows", lambda _: [{"seed": seed} for seed in found]
+    )
+    return found
+
+
+def test_successes_are_those_of_this_policy(tmp_path: Path, policy: Path, seeds: list[int]) -> None:
+    trained = read_checkpoint(policy)
+    write_stored(tmp_path, trained)
+    assert push._successes(tmp_path, trained) == Successes(1, 2, (0.01, 0.99), tuple(seeds))
+    write_stored(tmp_path, replace(trained, policy_sha256="0" * 64))
+    with pytest.raises(InputError, match="of another policy"):
+        push._successes(tmp_path, trained)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"env": TaskConfig("grasp", tolerance="released")}, "world or rules"),
+        ({"env": TaskConfig("grasp", scene=SceneConfig(grasp="attach"))}, "world or rules"),
+        ({"shift": Shift("light", 0.5)}, "a shift"),
+        ({"upset": True}, "upset on purpose"),
+        ({"acted_by": ("samples=8",)}, "settings of acting"),
+    ],
+)
+def test_successes_in_another_world_are_not_the_policys(
+    changes: dict[str, object], said: str, tmp_path: Path, policy: Path, seeds: list[int]
 ) -> None:
     trained = read_checkpoint(policy)
-    counts = {"successes": 1, "episodes": 2, "ci95": [0.01, 0.99]}
-    summary = {"task": "grasp", "policy": "mine", **counts}
-    about = {"checkpoint": {"policy_sha256": trained.policy_sha256}}
-    stored = {"format": FORMAT, "run": to_mapping(trained.run), "summary": summary, "about": about}
-    marker = tmp_path / "evaluation.json"
-    marker.write_text(json.dumps(stored))
-    monkeypatch.setattr(
-        "surgicai_vision.evaluation.storage.read_rows", lambda _: [{"seed": 7}, {"seed": 8}]
-    )
-    found = push._successes(tmp_path, trained)
-    assert found == Successes(1, 2, (0.01, 0.99), (7, 8))
-    about["checkpoint"]["policy_sha256"] = "0" * 64
-    marker.write_text(json.dumps(stored))
-    with pytest.raises(InputError, match="of another policy"):
+    write_stored(tmp_path, trained, **changes)
+    with pytest.raises(InputError, match=said):
+        push._successes(tmp_path, trained)
+
+
+@pytest.mark.parametrize("seed", [7, names.VALIDATION_SEED])
+def test_successes_on_starts_that_are_not_held_out_are_refused(
+    seed: int, tmp_path: Path, policy: Path, seeds: list[int]
+) -> None:
+    trained = read_checkpoint(policy)
+    write_stored(tmp_path, trained)
+    seeds[0] = seed
+    with pytest.raises(InputError, match="not held out"):
         push._successes(tmp_path, trained)

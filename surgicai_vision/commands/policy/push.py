@@ -8,6 +8,7 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import DIRECTORY
+from surgicai_vision.core.banks import HELD_OUT, bank_of
 from surgicai_vision.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -73,7 +74,8 @@ def _successes(folder: Path, checkpoint: "Checkpoint") -> "Successes":
     """Return the successes of an evaluation.
 
     Raises:
-        InputError: it is of another policy.
+        InputError: it is of another policy, or no evaluation of it as it was trained, on held-out
+            starts.
     """
     from surgicai_vision.evaluation.storage import read_evaluation, read_rows
     from surgicai_vision.training.hub import Successes
@@ -86,6 +88,20 @@ def _successes(folder: Path, checkpoint: "Checkpoint") -> "Successes":
         raise InputError(
             f"--evaluation {folder} is of another policy than {checkpoint.folder}; "
             "give one of this policy, or leave it out."
+        )
+    run = evaluation.run
+    other = {
+        "starts that are not held out": any(bank_of(seed) != HELD_OUT for seed in seeds),
+        "a world or rules that are not those of its training": run.env != checkpoint.task,
+        "a shift": run.shift is not None,
+        "episodes that were upset on purpose": run.upset,
+        "other settings of acting": bool(run.acted_by),
+    }
+    wrong = [what for what, holds in other.items() if holds]
+    if wrong:
+        raise InputError(
+            f"--evaluation {folder} has {' and '.join(wrong)}; the card names the successes of the "
+            "policy as it was trained. Give the folder of a plain evaluate, or leave it out."
         )
     summary = evaluation.summary
     low, high = summary["ci95"]
