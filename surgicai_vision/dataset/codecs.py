@@ -1,10 +1,12 @@
 """Lossless image codecs: RGB and segmentation as PNG, depth as float32 TIFF in metres."""
 
+import io
 from collections.abc import Buffer
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Pillow
 
 from surgicai_vision.core.errors import BadFile
 
@@ -39,6 +41,8 @@ def encode(frame: NDArray[np.uint8 | np.float32]) -> bytes:
     return content.tobytes()
 
 
+MOST_PIXELS = 2**26
+"""Pixels of the largest image that is decoded: 8,192 × 8,192."""
 DEPTH_NEAR = 0.02
 DEPTH_FAR = 0.22
 """Nearest and farthest depth that a grey image shows [m], in steps of 0.8 mm.
@@ -58,10 +62,12 @@ def decode(content: Buffer | None, where: str) -> NDArray[np.uint8 | np.float32]
     """Decode an image's buffer to (H, W, 3) uint8 RGB or (H, W, 1) float32.
 
     Raises:
-        BadFile: not an image; the message names it by `where`.
+        BadFile: not an image, or one of over `MOST_PIXELS`; the message names it by `where`.
     """
     data = np.frombuffer(content or b"", np.uint8)
     try:
+        if len(data) and _pixels(content) > MOST_PIXELS:
+            raise BadFile(f"{where}: its image has over {MOST_PIXELS} pixels.")
         frame = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
         if frame is None:
             raise BadFile(f"{where}: its image cannot be decoded.")
@@ -74,3 +80,14 @@ def decode(content: Buffer | None, where: str) -> NDArray[np.uint8 | np.float32]
         raise BadFile(
             f"{where}: its image cannot be decoded (OpenCV refuses its size or its channels)."
         ) from None
+
+
+def _pixels(content: Buffer | None) -> int:
+    """Return how many pixels an image's header claims; 0 if it cannot be read."""
+    try:
+        with Pillow.open(io.BytesIO(content or b"")) as image:
+            return image.width * image.height
+    except Pillow.DecompressionBombError:
+        return MOST_PIXELS + 1
+    except (OSError, ValueError, SyntaxError):
+        return 0

@@ -68,6 +68,7 @@ def export_features(
             shards.append(_write_shard(Path(scratch) / str(episode), part))
         meta = {
             **dataset.meta,
+            "request": None,  # it is not what was rendered
             "views": [],
             "depth": False,
             "segmentation": False,

@@ -35,6 +35,7 @@ from surgicai_vision.core.errors import (
     first_line,
 )
 from surgicai_vision.core.files import read_json, sha256_file
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.protocol import episode_bounds
 from surgicai_vision.dataset.video import read_frames
@@ -99,6 +100,10 @@ class RenderedDataset:
             self.late = max((int(asked.get("late", 0)) for asked in requests), default=0)
             self.has_depth = bool(self.meta["depth"])
             self.has_segmentation = bool(self.meta["segmentation"])
+            checked(self.meta["digest"], str, f"{file}: digest")
+            checked(self.meta["episodes"], int, f"{file}: episodes")
+            for view in self.views:
+                checked(self.meta["cameras"][view], dict, f"{file}: cameras")
             check_at_least(1, fps=self.fps, variants=self.variants, image_size=self.image_size)
             check_at_most(schema.SIZES[1], image_size=self.image_size)
         except DAMAGED as error:
@@ -261,6 +266,12 @@ class RenderedDataset:
         if values.dtype.kind not in "biuf" or len(values) != self.length:
             raise BadFile(
                 f"{self.path}: column {key} holds {column.type} or fewer than one number per frame."
+            )
+        wanted = schema.width(key, self.views)
+        if values.shape[1:] != ((wanted,) if wanted else ()):
+            raise BadFile(
+                f"{self.path}: column {key} has {values[0].size} numbers per frame; "
+                f"{max(wanted, 1)} are expected."
             )
         return values
 

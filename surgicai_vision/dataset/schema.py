@@ -6,6 +6,7 @@ digest therefore does not depend on how it was compressed, split into files or r
 """
 
 import hashlib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -72,6 +73,12 @@ def is_calibration(key: str) -> bool:
 def columns(views: Sequence[str]) -> tuple[str, ...]:
     """Return every column of a dataset that is not an image, in the order of the digest."""
     return (*COLUMNS, *calibration_keys(views))
+
+
+def width(key: str, views: Sequence[str]) -> int:
+    """Return how many numbers each frame has in a column; 0 for one number that is no vector."""
+    sides = calibration_keys(views).get(key)
+    return math.prod(sides) if sides else len(VECTORS.get(key, ()))
 
 
 def image_keys(views: Sequence[str], depth: bool, segmentation: bool) -> list[tuple[str, str, str]]:

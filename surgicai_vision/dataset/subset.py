@@ -118,6 +118,13 @@ def _since_visit(dataset: Dataset, rows: NDArray[np.int64]) -> dict[str, NDArray
     }
 
 
+def whole_of(dataset: Dataset) -> Dataset:
+    """Return the dataset that a subset was selected from, or a whole dataset itself."""
+    while isinstance(dataset, DatasetSubset):
+        dataset = dataset.whole
+    return dataset
+
+
 def first_of_visit(
     phase: NDArray[np.generic], episode_index: NDArray[np.int64]
 ) -> NDArray[np.int64]:

@@ -89,6 +89,9 @@ SOURCES = (NEAREST, RANDOM)
 GOAL_FREE_DEMONSTRATORS = frozenset({"search"})
 """Those that do not know at which point of the needle a grasp is requested, and try several."""
 
+PERSISTING_DEMONSTRATORS = frozenset({"search"})
+"""Those that continue after a success (`Demonstrator.persists`)."""
+
 SCRIPTED_DEMONSTRATORS = tuple(name for name in DEMONSTRATORS if name not in LEARNING_DEMONSTRATORS)
 
 

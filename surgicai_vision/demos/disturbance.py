@@ -75,7 +75,8 @@ class Disturbance:
         if rng.random() >= self.perturb_start_fraction:
             return True
         direction = np.append(rng.uniform(-1.0, 1.0, 6), 0.0).astype(np.float32)
-        for _ in range(rng.integers(*PERTURBATION_STEPS, endpoint=True)):
+        steps = int(rng.integers(*PERTURBATION_STEPS, endpoint=True))
+        for _ in range(-(-steps // env.config.action_repeat)):
             _, _, terminated, truncated, _ = env.step(direction)
             if terminated or truncated:
                 return False

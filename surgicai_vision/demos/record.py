@@ -41,6 +41,7 @@ from surgicai_vision.demos.demonstrator import (
     CHOOSING_DEMONSTRATORS,
     DEMONSTRATORS,
     LEARNING_DEMONSTRATORS,
+    PERSISTING_DEMONSTRATORS,
     BehaviourPolicy,
     make_demonstrator,
 )
@@ -167,7 +168,8 @@ def record(
         InputError: fewer than one episode, a negative seed or post_success_steps, starts that
             are reserved for validation or tests, an unknown demonstrator, demonstrations for a
             demonstrator that does not learn from any, none for one that does, a source for one
-            that chooses no demonstration, or upsets in a task that has none.
+            that chooses no demonstration, upsets in a task that has none, or held actions
+            (`action_repeat`) in demonstrations that go on after their success.
         OutputExists: `out` holds something else.
         SurgicaiError: the demonstrator failed at too many seeds.
     """
@@ -180,6 +182,7 @@ def record(
     check_training_starts(seed, episodes)
     _check_demos(demonstrator, demos, source)
     check_late(demonstrator, disturbance)
+    _check_held(config, demonstrator, post_success_steps)
     if disturbance.upset_fraction:
         check_upset_task(config.task)
     # What determines the result: a finished folder of the same request is left as it is. Unused
@@ -220,6 +223,21 @@ def _sources(kept: Sequence[Path]) -> dict[str, list[str]]:
     """Return the sha256 of each kept episode's source demonstration, if the episodes have one."""
     results = [read_json(path.parent / "result.json") for path in kept]
     return {"sources": [row["source"] for row in results]} if "source" in results[0] else {}
+
+
+def _check_held(config: TaskConfig, demonstrator: str, post_success_steps: int) -> None:
+    """Refuse held actions in demonstrations that go on after their success.
+
+    An env holds no action beyond a success, so that the steps after it would be shorter than those
+    before, and a dataset's timestamps wrong.
+    """
+    goes_on = post_success_steps > 0 or demonstrator in PERSISTING_DEMONSTRATORS
+    if config.action_repeat > 1 and goes_on:
+        raise InputError(
+            f"action_repeat is {config.action_repeat}, and demonstrations of '{demonstrator}' with "
+            f"post_success_steps {post_success_steps} go on after their success; record them with "
+            "action_repeat 1 ('export-demos' can hold their actions)."
+        )
 
 
 def _check_demos(demonstrator: str, demos: Sequence[Path], source: str) -> None:

@@ -24,7 +24,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import code_version, read_json, sha256_file, write_bytes, write_json
-from surgicai_vision.core.untrusted import parse_json
+from surgicai_vision.core.untrusted import checked, parse_json
 
 FORMAT = "surgicai-vision-demos"
 VERSION = 2
@@ -118,6 +118,14 @@ class Demo:
         numbers = (self.state, self.action, self.reward, executed)
         if not all(np.isfinite(array).all() for array in numbers):
             raise InputError("Demo holds numbers that are not finite.")
+        largest = max(float(np.abs(array).max()) for array in (self.action, executed))
+        if largest > 1.0:
+            raise InputError(f"Demo has an action of {largest:g}; allowed: -1 to 1.")
+        if not -1 <= self.phase.min() <= self.phase.max() < len(names.SUBTASKS):
+            raise InputError(
+                f"Demo has phases {self.phase.min()} to {self.phase.max()}; allowed: -1 to "
+                f"{len(names.SUBTASKS) - 1}."
+            )
 
     @property
     def arrays(self) -> dict[str, NDArray[np.generic]]:
@@ -181,6 +189,9 @@ def read_demo(path: Path) -> Demo:
         fields = {field.name for field in dataclasses.fields(Demo)} - {*ARRAYS, EXECUTED, SOURCE}
         if set(details) - {SOURCE} != fields:
             raise BadFile(f"{path}: its metadata has {sorted(details)}; expected {sorted(fields)}.")
+        for name, value in details.items():
+            if name != "config":
+                checked(value, int if name == "seed" else str, f"{path}: {name}")
         return Demo(**details, **arrays)
     except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
         raise BadFile(f"{path} cannot be read as a demonstration ({error}).") from None
@@ -218,6 +229,10 @@ def read_marker(folder: Path) -> dict[str, Any]:
     if not isinstance(marker, dict) or marker.get("format") != FORMAT:
         raise BadFile(f"{folder / MARKER} is not of format {FORMAT}.")
     _check_version(folder / MARKER, marker.get("version"))
+    for key in ("task", "demonstrator"):
+        checked(marker.get(key), str, f"{folder / MARKER}: {key}")
+    if marker.get("request") is not None:
+        checked(marker["request"], dict, f"{folder / MARKER}: request")
     return marker
 
 

@@ -31,7 +31,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 import numpy as np
 from filelock import Timeout
@@ -49,6 +49,7 @@ from surgicai_vision.core.errors import (
 from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, locked, read_json, write_json
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.core.untrusted import checked
+from surgicai_vision.dataset.subset import whole_of
 
 if TYPE_CHECKING:
     from encoders.base import Encoder
@@ -69,6 +70,7 @@ class Manifest(TypedDict):
 
     format: int
     dataset: str
+    whole: NotRequired[str]  # not in entries of earlier versions
     view: str
     encoder: str
     card: dict[str, JSON]
@@ -223,6 +225,7 @@ def _read_manifest(folder: Path) -> Manifest:
     stored = checked(read_json(folder / MANIFEST), dict, MANIFEST)
     for key, kind in MANIFEST_KINDS.items():
         checked(stored.get(key), kind, f"{MANIFEST}: {key}")
+    checked(stored.get("whole", ""), str, f"{MANIFEST}: whole")
     sides = [checked(side, int, f"{MANIFEST}: shape") for side in stored["shape"]]
     if stored["length"] < 1 or min(sides, default=0) < 1 or math.prod(sides) != stored["dim"]:
         raise BadFile(f"{MANIFEST}: its length, shape and dim cannot be those of features")
@@ -235,6 +238,7 @@ def _manifest(dataset: "Dataset", view: str, encoder: "Encoder") -> Manifest:
     return {
         "format": FORMAT,
         "dataset": dataset.fingerprint,
+        "whole": whole_of(dataset).fingerprint,
         "view": view,
         "encoder": encoder.card.name,
         "card": to_mapping(encoder.card),
@@ -382,11 +386,13 @@ def prune_cache(root: Path | None = None, keep_datasets: Collection[str] = ()) -
 
     Args:
         root: folder of the cache; `default_cache_root()` by default.
-        keep_datasets: fingerprints of the datasets whose complete entries stay.
+        keep_datasets: fingerprints of the datasets whose complete entries stay, and those of
+            frames selected from them (`dataset.subset`).
     """
     removed = []
     for entry in list_cache(root):
-        if entry.manifest is not None and entry.manifest["dataset"] in keep_datasets:
+        known = entry.manifest
+        if known and {known["dataset"], known.get("whole")} & set(keep_datasets):
             continue
         try:
             with locked(entry.folder / LOCK, wait=False):

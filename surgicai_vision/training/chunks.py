@@ -24,7 +24,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.reader import RenderedDataset
-from surgicai_vision.dataset.subset import DatasetSubset
+from surgicai_vision.dataset.subset import DatasetSubset, whole_of
 from surgicai_vision.demos.store import demos_digest, list_demos, read_demo
 
 BESIDE = "demos"
@@ -59,7 +59,7 @@ def timeline_of(dataset: Dataset, demos: Path | None = None) -> Timeline:
     Raises:
         InputError: frames were left out, and the demonstrations are missing or different ones.
     """
-    root = _root(dataset)
+    root = whole_of(dataset)
     if root.fps == root.config.steps_per_second:
         columns = root.columns()
         phase = columns.get(names.PHASE)
@@ -118,13 +118,6 @@ def with_chunks(dataset: Dataset, timeline: Timeline, offsets: Sequence[int]) ->
         {"chunks": " ".join(map(str, offsets))},
         added={names.ACTION_CHUNK: chunks},
     )
-
-
-def _root(dataset: Dataset) -> Dataset:
-    """Return the dataset that a subset was selected from, or a whole dataset itself."""
-    while isinstance(dataset, DatasetSubset):
-        dataset = dataset.whole
-    return dataset
 
 
 def _rows(dataset: Dataset) -> NDArray[np.int64]:

@@ -406,6 +406,7 @@ def test_a_dataset_knows_how_late_its_demonstrators_noticed_a_loss(tmp_path, fak
     [
         *("no meta", "not json", "key gone", "short data", "data gone", "not parquet"),
         *({"image_size": 10**9}, {"image_size": 1e999}, {"fps": 0}, {"variants": 0}),
+        *({"cameras": {}}, {"cameras": {"front": 1}}, {"digest": None}, {"episodes": "1"}),
     ],
     ids=str,
 )
@@ -537,21 +538,23 @@ def test_a_good_dataset_has_no_problems(tmp_path, fake, demos):
     )
 
 
-def huge_png():
-    """A PNG whose header promises 60000 × 60000 pixels."""
+def huge_png(side):
+    """A PNG of a few bytes whose header promises `side` × `side` pixels."""
 
     def chunk(kind, content):
         checksum = zlib.crc32(kind + content)
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
 
-    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
     parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"0")), chunk(b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-def test_an_image_beyond_the_decoders_limit_is_a_bad_file():
-    with pytest.raises(BadFile, match="x: its image cannot be decoded"):
-        codecs.decode(huge_png(), "x")
+@pytest.mark.parametrize("side", [9_000, 60_000])
+def test_a_huge_image_is_refused_before_it_is_decoded(side, monkeypatch):
+    monkeypatch.setattr(codecs.cv2, "imdecode", None)
+    with pytest.raises(BadFile, match="x: its image has over 67108864 pixels"):
+        codecs.decode(huge_png(side), "x")
 
 
 BAD_STATISTICS = {

@@ -34,6 +34,14 @@ def test_an_empty_folder_is_taken_and_one_with_files_refused(dataset, tmp_path):
         export_features(dataset, [rows], ABOUT, tmp_path / "out")
 
 
+def test_an_export_is_not_what_was_rendered(dataset, tmp_path):
+    rows = np.zeros((dataset.length, 2), np.float32)
+    export_features(dataset, [rows], ABOUT, tmp_path / "out")
+    demos = dataset.path.parent / "demos"
+    with pytest.raises(OutputExists):
+        render_demos(demos, tmp_path / "out", views=("back",), size=32, context=RunContext(0))
+
+
 def test_what_a_kill_leaves_is_named_as_everything_that_may_be_deleted(
     dataset, tmp_path, monkeypatch
 ):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -303,6 +304,43 @@ def test_a_start_that_cannot_be_made_is_skipped(tmp_path, fake, monkeypatch):
     assert 1 not in [read_demo(path).seed for path in paths]
     skipped = {row["seed"]: row["reason"] for row in read_marker(tmp_path / "demos")["skipped"]}
     assert skipped[1] == "No start of 'grasp' was physical in 20 draws."
+
+
+@pytest.mark.parametrize(
+    "goes_on", [{"post_success_steps": 10}, {"demonstrator": "search"}], ids=str
+)
+def test_demonstrations_that_go_on_hold_no_actions(goes_on, tmp_path):
+    """An env holds no action beyond a success: their timestamps would be wrong."""
+    held = TaskConfig("grasp", action_repeat=2)
+    with pytest.raises(InputError, match="go on after their success"):
+        record(held, episodes=1, out=tmp_path / "out", context=RunContext(0), **goes_on)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("held", "moves"), [(1, 8), (2, 4), (3, 3)])
+def test_a_perturbed_start_is_as_far_off_however_long_an_action_is_held(held, moves):
+    taken = []
+
+    class Env:
+        config = TaskConfig("grasp", action_repeat=held)
+        simulation = SimpleNamespace(task_state=SimpleNamespace(steps=3, tip_path=1.0))
+
+        def step(self, action):
+            taken.append(action)
+            return None, 0.0, False, False, {}
+
+    class Least:
+        def random(self):
+            return 0.0
+
+        def uniform(self, low, high, size):
+            return np.full(size, high)
+
+        def integers(self, low, high, endpoint):
+            return low
+
+    assert Disturbance(perturb_start_fraction=1.0).perturb_start(Env(), Least())
+    assert len(taken) == moves and Env.simulation.task_state.steps == 0
 
 
 def test_record_again_does_nothing_and_another_request_is_refused(tmp_path, fake, monkeypatch):

@@ -19,6 +19,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.executor import RunContext
+from surgicai_vision.demos.imports import lerobot_dataset
 from surgicai_vision.demos.imports.lerobot_dataset import import_dataset
 from surgicai_vision.demos.imports.rosbag.config import BagConfig, Frames
 from surgicai_vision.demos.record import record
@@ -243,6 +244,22 @@ def other(key: str, value: object) -> Callable[[Rows], Rows]:
 def first(key: str, value: object) -> Callable[[Rows], Rows]:
     """Return a function that puts a value into a column's first frame."""
     return lambda rows: {**rows, key: [value, *rows[key][1:]]}
+
+
+def test_too_many_frames_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_dataset(tmp_path / "dataset", [STILL])
+    monkeypatch.setattr(lerobot_dataset, "MAX_FRAMES", len(STILL["timestamp"]) - 1)
+    monkeypatch.setattr(lerobot_dataset.DatasetFiles, "_tasks", lambda _: {})
+    monkeypatch.setattr(lerobot_dataset.pq, "read_table", None)
+    with pytest.raises(BadFile, match="holds over"):
+        import_dataset(path, task="place", out=tmp_path / "out")
+
+
+def test_held_actions_are_refused(demos: list[Demo], tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "dataset", [rows_of(demos[0], 0)])
+    with pytest.raises(InputError, match="action_repeat is 5"):
+        import_dataset(path, task="place", out=tmp_path / "out", env={"action_repeat": 5})
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

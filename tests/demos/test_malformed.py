@@ -283,6 +283,13 @@ def demonstrations():
     def tensor(**changes):
         return {**table, "action": {**table["action"], **changes}}
 
+    def values(name, content):
+        low, high = table[name]["data_offsets"]
+        return tensors(table, body[:low] + content + body[high:])
+
+    count = table["action"]["shape"][0]
+    wide = np.full((count, 7), 5.0, np.float32).tobytes()
+
     def detail(**changes):
         details = {**json.loads(table["__metadata__"]["demo"]), **changes}
         return {**table, "__metadata__": {"demo": json.dumps(details)}}
@@ -317,6 +324,13 @@ def demonstrations():
         "config of another kind": tensors(detail(config=3), body),
         "unknown task": tensors(detail(config={"task": "stitch"}), body),
         "unknown config key": tensors(detail(config={"task": "grasp", "hook": "os:system"}), body),
+        "seed of text": tensors(detail(seed="x"), body),
+        "seeds": tensors(detail(seed=[1, 2]), body),
+        "demonstrators": tensors(detail(demonstrator=["a"]), body),
+        "code of another kind": tensors(detail(code_version={"a": 1}), body),
+        "scene of another kind": tensors(detail(scene_hash=5), body),
+        "actions out of range": values("action", wide),
+        "phases out of range": values("phase", np.full(count, 100, np.int8).tobytes()),
         "not finite": tensors(table, np.full(len(body) // 8 + 1, np.nan).tobytes()[: len(body)]),
         "pickle": pickle.dumps(Call(os.system, "true")),
     }
@@ -394,6 +408,11 @@ def data_files(dataset):
         text = pa.array(["os.system"] * len(table))
         cases[f"text in {key}"] = parquet_bytes(
             table.set_column(table.schema.get_field_index(key), key, text)
+        )
+    for key in (names.STATE, names.NEEDLE_POSE):
+        numbers = pa.array(np.full(len(table), 0.1, np.float32))
+        cases[f"one number in {key}"] = parquet_bytes(
+            table.set_column(table.schema.get_field_index(key), key, numbers)
         )
     wrong = {
         "rubbish": b"\x89PNG\r\n\x1a\n" + bytes(40),

@@ -13,8 +13,10 @@ from fake_dataset import FakeData
 from tiny_encoder import TINY
 
 from encoders.random_resnet import CARD
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
 from surgicai_vision.core.files import write_json
+from surgicai_vision.dataset.subset import DatasetSubset
 from surgicai_vision.features import cache as module
 from surgicai_vision.features import encoders
 from surgicai_vision.features.cache import encode, entry_key, list_cache, prune_cache
@@ -28,6 +30,9 @@ class FakeDataset(FakeData):
     fingerprint: str = "data"
     views: tuple[str, ...] = ("front", "back")
     reads: int = 0
+    config: TaskConfig = TaskConfig()
+    task: str = "grasp"
+    image_size: int = 4
 
     def frames(self, view: str, start: int, stop: int) -> np.ndarray:
         self.reads += stop - start
@@ -192,6 +197,21 @@ def test_list_and_prune(tmp_path: Path) -> None:
     assert len(removed) == 2
     (left,) = list_cache(tmp_path)
     assert left.manifest is not None and left.manifest["dataset"] == "data" and left.size > 0
+
+
+def test_features_of_some_frames_of_a_dataset_are_kept_with_it(tmp_path: Path) -> None:
+    for name in ("data", "old"):
+        whole = FakeDataset(fingerprint=name)
+        encode(
+            DatasetSubset(whole, np.arange(0, 23, 5), {"stride": 5}),
+            "front",
+            FakeEncoder(),
+            tmp_path,
+        )
+    assert len(prune_cache(tmp_path, keep_datasets={"data"})) == 1
+    (left,) = list_cache(tmp_path)
+    assert left.manifest is not None and left.manifest.get("whole") == "data"
+    assert left.manifest["dataset"] != "data"
 
 
 def test_cache_root_follows_the_environment(

@@ -222,7 +222,8 @@ def demo_poses(demo: Demo) -> DemoPoses:
         needles.append(poses.square(simulation.needle()))
         tips.append(poses.square(simulation.tip(arm)))
         jaws.append(simulation.commands[arm].jaw)
-    return DemoPoses(np.array(needles), np.array(tips), np.array(jaws), env.stitch, arm, env.dt)
+    dt = env.dt * demo.config.action_repeat
+    return DemoPoses(np.array(needles), np.array(tips), np.array(jaws), env.stitch, arm, dt)
 
 
 # -- the needle is carried -------------------------------------------------------------------------

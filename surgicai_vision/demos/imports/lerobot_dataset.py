@@ -201,13 +201,13 @@ class DatasetFiles:
         total = 0
         for file in sorted(self._path.glob(DATA)):
             try:
+                total += pq.read_metadata(file).num_rows
+                if total > MAX_FRAMES:  # before they are in memory
+                    raise BadFile(f"{self._path} holds over {MAX_FRAMES} frames.")
                 table = pq.read_table(file, columns=self._columns)
             except UNREADABLE as error:
                 raise BadFile(f"{file} cannot be read ({first_line(error)}).") from None
             numbers = _whole(table, "episode_index", str(file))
-            total += len(table)
-            if total > MAX_FRAMES:
-                raise BadFile(f"{self._path} holds over {MAX_FRAMES} frames.")
             for start, stop in runs_of(numbers):
                 part = table.slice(start, stop - start)
                 if waiting is not None and _number(waiting) == _number(part):

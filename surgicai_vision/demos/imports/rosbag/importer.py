@@ -122,10 +122,21 @@ def import_bags(
 
 
 def base_config(task: str | None, env: Mapping[str, object] | None) -> TaskConfig:
-    """Return the env of an import: that of the requested subtask, or of any."""
-    return from_mapping(
+    """Return the env of an import: that of the requested subtask, or of any.
+
+    Raises:
+        UnknownName: no subtask of that name, or no such key.
+        InputError: an env whose actions are held; a recorded motion is that of every control step.
+    """
+    config = from_mapping(
         TaskConfig, {**(env or {}), "task": check_name("subtask", task or "grasp", names.SUBTASKS)}
     )
+    if config.action_repeat != 1:
+        raise InputError(
+            f"env: action_repeat is {config.action_repeat}; an import has an action for every "
+            "control step: leave it out ('export-demos' can hold its actions)."
+        )
+    return config
 
 
 def check_folders(out: Path, task: str | None) -> None:
