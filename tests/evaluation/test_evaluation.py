@@ -50,6 +50,10 @@ class FakeEnv:
         self.seed, self.count = seed, 0
         return np.zeros(21, np.float32), self._info()
 
+    @property
+    def simulation(self):
+        return SimpleNamespace(task_state=SimpleNamespace(steps=self.count))
+
     def step(self, action):
         self.count += 1
         if self.seed == 99 and self.count == 2:
