@@ -20,6 +20,7 @@ Interface:
 
 import abc
 import copy
+import json
 from dataclasses import dataclass, field
 from typing import final
 
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 from policies.base import ACTIONS, Inputs, Policy, Recipe, fed_vector
 from policies.layers import FeatureHeads
 from surgicai_vision.core.config import JSON
-from surgicai_vision.core.errors import InputError, check_at_least, check_at_most, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_at_most, check_name, shown
 
 NORMALISATIONS = ("mean_std", "min_max")
 MOST_PLANNED = 1_000
@@ -81,8 +82,20 @@ class ChunkRecipe(Recipe):
             raise InputError(
                 f"clip_gradient is {self.clip_gradient}, minutes {self.minutes}; at least 0."
             )
+        for name, value in self.settings.items():
+            if not _is_plain(value):
+                raise InputError(f"settings: {name} is {shown(value)}; give plain, finite data.")
         if not self.proprioception and not self.privileged:
             raise InputError("A policy that plans chunks needs proprioception; keep it on.")
+
+
+def _is_plain(value: object) -> bool:
+    """Return True for what JSON can hold; a YAML file may also hold dates and infinite numbers."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 class ChunkPolicy(Policy, abc.ABC):

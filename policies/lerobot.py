@@ -14,7 +14,7 @@ import importlib
 from policies.base import Plugin, Policy, Recipe
 from policies.chunks import ChunkRecipe
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, first_line
 
 ADAPTER = "lerobot_env_surgicai.chunk_policies"
 DOWN_DIMS = (512, 1024, 2048)
@@ -41,7 +41,13 @@ def _make(kind: str, recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> Pol
             f"LeRobot's policies need the distribution lerobot_env_surgicai ({error}); install "
             "it alongside surgicai-vision."
         ) from None
-    policy: Policy = vars(adapter)[kind](recipe, visual)
+    try:
+        policy: Policy = vars(adapter)[kind](recipe, visual)
+    except (AssertionError, ArithmeticError, RuntimeError, TypeError, ValueError) as error:
+        # LeRobot and torch check the settings of a network as they build it.
+        raise InputError(
+            f"LeRobot's {kind} cannot be made with these settings ({first_line(error)})."
+        ) from error
     return policy
 
 

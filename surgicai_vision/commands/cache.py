@@ -50,7 +50,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
             f"prune deletes features in {default_cache_root()}; give either --keep DIR or --all."
         )
     if prune:
-        kept = {folders.open_dataset(folder, "", ()).fingerprint for folder in options.keep}
+        kept = {folders.open_dataset(folder, None, ()).fingerprint for folder in options.keep}
         entries = prune_cache(keep_datasets=kept)
     else:
         entries = list_cache()

@@ -18,9 +18,10 @@ from surgicai_vision.commands.options import (
     AcceptLicence,
     DatasetFolder,
     WeightFiles,
+    default_text,
 )
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.core.files import check_output
+from surgicai_vision.core.files import check_output, check_renamed
 from surgicai_vision.features import devices, encoders
 
 app = App(
@@ -37,7 +38,7 @@ class Options:
     """Options of `encode`.
 
     Attributes:
-        task: The dataset's task.
+        task: The task, which must be that of a given dataset.
         dataset: Folder of the dataset.
         encoder: Encoder.
         view: Views to encode.
@@ -46,7 +47,7 @@ class Options:
         export: Also write a dataset with features instead of images, for LeRobot's policies.
     """
 
-    task: Annotated[str, TASK] = "grasp"
+    task: Annotated[str | None, TASK, default_text("the dataset's, else grasp")] = None
     dataset: DatasetFolder = None
     encoder: Annotated[str, ENCODER] = "imagenet-lite"
     view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
@@ -68,6 +69,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         if options.pool != "global":
             raise InputError(f"--export writes global features; leave --pool {options.pool} out.")
         check_output(options.export, option="--export")
+        check_renamed(options.export, "--export")
     from surgicai_vision.features.cache import encode
 
     encoder = encoders.load_encoder(options.encoder, options.pool, weights, options.device)

@@ -180,6 +180,11 @@ def _filming(options: Options) -> "Filming | None":
     from surgicai_vision.evaluation.films import INDEX, Filming, Look
 
     if options.video is None:
+        plain = Options(policy="")
+        for name in ("video_of", "video_view", "video_size"):
+            if getattr(options, name) != getattr(plain, name):
+                option = f"--{name.replace('_', '-')}"
+                raise InputError(f"{option} goes with --video; give both or leave it out.")
         return None
     folders.check_folder(options.video, INDEX, "--video")
     return Filming(options.video, options.video_of, Look(options.video_view, options.video_size))
@@ -199,7 +204,7 @@ def open_given(
 
     demonstrated = None
     if policy == REPLAY:
-        demonstrated = folders.open_dataset(dataset, task or "grasp", ())
+        demonstrated = folders.open_dataset(dataset, task, ())
     elif dataset:
         raise InputError("--dataset is only for replay; leave it out.")
     return open_policy(

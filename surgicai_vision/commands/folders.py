@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from surgicai_vision.core import files
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 
 if TYPE_CHECKING:
@@ -84,16 +85,28 @@ def check_task(given: str | None, recorded: str, folder: Path) -> None:
         raise InputError(f"--task {given}: {folder} shows {recorded}; leave --task out.")
 
 
-def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> "RenderedDataset":
+def open_dataset(folder: Path | None, task: str | None, views: Sequence[str]) -> "RenderedDataset":
     """Open a dataset, by default the task's.
+
+    Args:
+        folder: the dataset; None: where `render-demos` puts that of the task.
+        task: the task that it must show; None goes with any, and without a folder with the grasp.
+        views: views that it must have.
 
     Raises:
         BadFile: no dataset there; the message says which command makes it.
         UnknownName: a view the dataset does not have.
+        InputError: the dataset shows another task.
     """
-    path = folder or dataset_folder(task)
+    if folder is not None and not folder.exists():
+        raise BadFile(
+            f"There is no dataset {folder}; make it with "
+            f"`surgicai-vision render-demos --out {folder}`, or give another folder."
+        )
+    task_shown = task or TaskConfig.task
+    path = folder or dataset_folder(task_shown)
     if not path.exists():
-        command = f"surgicai-vision render-demos --task {task} --episodes 50"
+        command = f"surgicai-vision render-demos --task {task_shown} --episodes 50"
         raise BadFile(
             f"There is no dataset {path}; make it with `{command}`, or give one with --dataset DIR."
         )
@@ -102,6 +115,7 @@ def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> "Rende
     dataset = open_folder(path)
     for view in views:
         check_name("view of this dataset", view, dataset.views)
+    check_task(task, dataset.task, path)
     return dataset
 
 

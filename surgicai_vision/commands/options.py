@@ -43,6 +43,11 @@ def _whole_number(_: type, tokens: Sequence[Token]) -> int:
         raise ValueError(f"expected a whole number, got '{tokens[0].value}'.") from None
 
 
+def _whole_numbers(_: type, tokens: Sequence[Token]) -> tuple[int, ...]:
+    """Convert texts to integers; cyclopts itself would round 3.5."""
+    return tuple(_whole_number(int, [token]) for token in tokens)
+
+
 def _refuse_repetition(_: type, values: Sequence[object] | None) -> None:
     """Raise ValueError if a list holds a value twice."""
     given = values or ()
@@ -85,12 +90,15 @@ COUNT = Parameter(converter=_whole_number, validator=validators.Number(gte=1), m
 NOT_NEGATIVE = Parameter(converter=_whole_number, validator=validators.Number(gte=0), metavar="N")
 SEED = within(0, LARGEST_INTEGER)
 """Seed of a training or of the first start; a row cannot hold a larger number."""
+DURATION = Parameter(validator=validators.Number(gt=0, lte=1e6), metavar="S")
+"""A time [s], at most eleven days."""
 FRACTION = Parameter(validator=validators.Number(gte=0, lte=1), metavar="P")
 IMAGE_SIZE = Parameter.combine(within(16, 960), Parameter(metavar="PX"))
 """Height and width [px] within the limits of the renderer."""
 LIST = Parameter(show_default=_show_list)
 UNIQUE = Parameter(show_default=_show_list, validator=_refuse_repetition)
 """A comma list without repeated values."""
+WHOLE_NUMBERS = Parameter.combine(UNIQUE, Parameter(converter=_whole_numbers, metavar="N[,N]"))
 VIEWS = Parameter.combine(UNIQUE, Parameter(choices=camera_names(), metavar="VIEW[,VIEW]"))
 VIDEO = Parameter(
     help="Store RGB as video with this codec; the error is measured.",

@@ -41,7 +41,7 @@ class Options:
     """Options of `probe`.
 
     Attributes:
-        task: The dataset's task.
+        task: The task, which must be that of a given dataset.
         dataset: Folder of the dataset.
         encoder: Encoders to probe.
         view: Views to probe, each alone and all together.
@@ -50,7 +50,7 @@ class Options:
         out: Folder for probe.json; an earlier one is replaced.
     """
 
-    task: Annotated[str, TASK] = "grasp"
+    task: Annotated[str | None, TASK, default_text("the dataset's, else grasp")] = None
     dataset: DatasetFolder = None
     encoder: Annotated[tuple[str, ...], ENCODERS] = ("imagenet-lite",)
     view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")

@@ -28,6 +28,7 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RANDOMISATION_CHOICES
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.files import check_renamed
 from surgicai_vision.core.variants import Variants
 
 app = App(
@@ -124,6 +125,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     of_others = "" if options.layout == "surgicai" else f"-{options.layout}"
     out = options.out or folders.dataset_folder(f"{task}{of_others}")
     folders.check_folder(out, names.META_FILE)
+    check_renamed(out)  # before any demonstration is recorded
     layout = LAYOUTS[options.layout]
     check_request(options.view, options.size, options.frame_stride, options.video, options.layout)
     if not options.demos:

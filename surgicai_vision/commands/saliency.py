@@ -11,7 +11,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.options import (
     SEED,
-    UNIQUE,
+    WHOLE_NUMBERS,
     AcceptLicence,
     EnvFields,
     PolicyTask,
@@ -48,7 +48,7 @@ class Options:
     policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
     task: PolicyTask = None
     seed: Annotated[int, SEED] = names.TEST_SEED
-    step: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = (0, 20, 40, 60)
+    step: Annotated[tuple[int, ...], WHOLE_NUMBERS] = (0, 20, 40, 60)
     patch: Annotated[int, within(2, 960), Parameter(metavar="PX")] = 32
     weights: WeightFiles = ()
     accept_licence: AcceptLicence = False

@@ -23,6 +23,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
+from surgicai_vision.core.errors import InputError
 
 app = App(
     name="scene",
@@ -100,6 +101,13 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     from surgicai_vision.evaluation.provenance import provenance
     from surgicai_vision.evaluation.rollout import evaluate
 
+    drawings = {
+        f"--{name}": getattr(options, name)
+        for name in ("sheet", "film", "animation", "axes", "looks", "needles", "placements")
+    }
+    given = [option for option, path in drawings.items() if path]
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} are given; one call draws one of them.")
     if options.film:
         return _film(options.film, options, console)
     if options.animation:

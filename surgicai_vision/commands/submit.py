@@ -9,6 +9,7 @@ from cyclopts import App, Parameter, validators
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import default_text
+from surgicai_vision.core.errors import OutputExists
 from surgicai_vision.core.files import check_output
 
 app = App(
@@ -72,5 +73,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
 def _check_out(out: Path) -> None:
     """Refuse a row's file that exists already or cannot be written."""
+    if out.is_file():
+        raise OutputExists(f"--out {out} exists already; give a file that does not exist yet.")
     check_output(out)
     folders.check_file(out, "--out", (".json",))

@@ -36,7 +36,7 @@ example:
 a headline from scratch, for its first training seed; without --only, for all of them:
   surgicai-vision sweep procedure --only seed=0
 reinforcement-learning algorithms:
-  surgicai-vision sweep rl-demonstrations --only algo=td3-her-bc task=grasp
+  surgicai-vision sweep rl-demonstrations --only algo=td3-her-bc --only task=grasp
 to try a file in minutes:
   surgicai-vision sweep procedure --demonstrations 5 --epochs 1 --episodes 2 --size 64""",
 )

@@ -216,7 +216,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     )
     # Refuses a recipe that does not exist before any work.
     policies.check_progress_from(policies.recipe_of(run), options.progress_from)
-    rendered = folders.open_dataset(options.dataset, run.task, run.views)
+    shown = options.task if options.dataset else run.task
+    rendered = folders.open_dataset(options.dataset, shown, run.views)
     task = rendered.config.task
     folders.check_task(options.task, task, rendered.path)
     label = f"{options.subtask}-of-{task}" if options.subtask else task
@@ -283,8 +284,6 @@ def _views(options: Options, encoder: str | None) -> tuple[str, ...]:
     return ("front", "back") if options.view is None else options.view
 
 
-LARGEST_REINFORCED_SEED = 2**32 - 1
-"""Largest seed of Stable-Baselines3 and d3rlpy, as of NumPy's legacy generator."""
 IMITATION = "imitation from a dataset"
 ONLINE = "an online --algo"
 OFFLINE = "an offline --algo"
@@ -406,7 +405,9 @@ def _checked_folders(options: Options, runs: Sequence[RunConfig]) -> list[Path]:
         InputError: a folder that cannot be written, or a seed that the libraries do not take.
         OutputExists: a folder that holds something else.
     """
-    check_at_most(LARGEST_REINFORCED_SEED, seed=max(run.seed for run in runs))
+    from surgicai_vision.rl.settings import LARGEST_SEED
+
+    check_at_most(LARGEST_SEED, seed=max(run.seed for run in runs))
     outs = [options.out or folders.train_folder(run.task, run.name, run.seed) for run in runs]
     for out in outs:
         folders.check_folder(out, REQUEST)

@@ -389,6 +389,8 @@ def convert(hint: object, value: object, where: str) -> object:
     if origin is tuple:
         if isinstance(value, str) or not isinstance(value, (list, tuple)):
             raise InputError(f"{where}: expected a list, got {shown(value)}.")
+        if Ellipsis not in arguments and len(value) != len(arguments):
+            raise InputError(f"{where}: expected {len(arguments)} values, got {len(value)}.")
         return tuple(convert(arguments[0], item, where) for item in value)
     if origin in (dict, Mapping):
         if not isinstance(value, Mapping):

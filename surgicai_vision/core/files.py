@@ -105,7 +105,12 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder next to `path`, renamed to it at the end; removed on an error."""
+    """Yield a temporary folder next to `path`, renamed to it at the end; removed on an error.
+
+    Raises:
+        InputError: nothing can be renamed to `path` (`check_renamed`).
+    """
+    check_renamed(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}-{path.name}")
     temporary.mkdir()
@@ -207,9 +212,28 @@ def _check_output(path: Path, may_resume: str | None, option: str, ours: Collect
     parent = path
     while not parent.exists():
         parent = parent.parent
-    if not os.access(parent, os.W_OK | os.X_OK) or not parent.is_dir():
+    if not parent.is_dir():
+        raise InputError(f"{option} {path} cannot be written: {parent} is a file.")
+    if not os.access(parent, os.W_OK | os.X_OK):
         raise InputError(
             f"{option} {path} cannot be written: no permission on {parent}; choose another folder."
+        )
+
+
+def check_renamed(path: Path, option: str = "--out") -> None:
+    """Refuse an output folder that nothing can be renamed to, before any work.
+
+    Args:
+        path: the folder that another one becomes by one rename.
+        option: the option that gave it, for the message.
+
+    Raises:
+        InputError: it is the current folder or one above it, a link, or a mount point.
+    """
+    if path.name in ("", "..") or path.is_symlink() or path.is_mount():
+        raise InputError(
+            f"{option} {path} is the current folder, a link or a mount point, which cannot be "
+            "replaced by the finished folder; give a folder below it."
         )
 
 

@@ -31,6 +31,7 @@ from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import Row
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
+from surgicai_vision.training import released
 from surgicai_vision.training.run_config import Starts
 
 CHOSEN = "hierarchical.yaml"
@@ -94,7 +95,7 @@ def sweep_ends(
         InputError: privileged ends, test starts, or values that are not allowed.
         OutputExists: `out` holds another policy or other starts.
     """
-    given = read_hierarchical(path)
+    given = read_hierarchical(released.resolve(path))
     if given.termination != "learned":
         raise InputError(
             f"{path} has termination: {given.termination}; only learned ends have a confidence."

@@ -15,6 +15,7 @@ import numpy as np
 from encoders.base import Encoder
 from policies.base import Plugin, Policy, Recipe
 from policies.chunks import ChunkRecipe
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import read_json
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.dataset.protocol import Dataset
@@ -81,6 +82,8 @@ def train_run(
     if progress_policy is not None:
         check_progress_policy(progress_policy.checkpoint, dataset)
     start_policy = policies.load_policy(start) if start else None
+    if start_policy is not None:
+        _check_start(start_policy, run, recipe)
     learned = _Learned(dataset, _encode(run, dataset, stage, weights, encodes_on))
     if progress_policy is not None:
         learned = learned.select(_fed(dataset, progress_policy, stage, weights))
@@ -103,6 +106,38 @@ def train_run(
             device=trains_on,
             log=log,
         )
+
+
+def _check_start(start: Policy, run: RunConfig, recipe: Recipe) -> None:
+    """Refuse to start from a policy of other inputs, before anything is encoded.
+
+    Raises:
+        InputError: its inputs differ; the message names them.
+    """
+    known = start.checkpoint
+    inputs = {
+        "encoder": (known.run.encoder, run.encoder),
+        "views": (known.run.views, run.views),
+        "pool": (known.run.pool, run.pool),
+        **{
+            key: (known.recipe.get(key), getattr(recipe, key, None))
+            for key in ("proprioception", "setpoint", "clock", "progress_input", "privileged")
+        },
+    }
+    differ = [
+        f"{name} {_words(was)}, not {_words(now)}"
+        for name, (was, now) in inputs.items()
+        if was != now
+    ]
+    if differ:
+        raise InputError(
+            f"The policy to start from has {'; '.join(differ)}. Train with the inputs that it has."
+        )
+
+
+def _words(value: object) -> str:
+    """Return an input's value in words."""
+    return ", ".join(map(str, value)) or "none" if isinstance(value, tuple) else str(value).lower()
 
 
 class _Learned(NamedTuple):

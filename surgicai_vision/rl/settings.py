@@ -19,6 +19,8 @@ from surgicai_vision.rl.algorithms import ALGORITHMS, Algorithm
 
 OBSERVATIONS = ("relative", "state")
 DEMANDS = ("auto", "achieved", "kept")
+LARGEST_SEED = 2**32 - 1
+"""Largest seed of Stable-Baselines3 and d3rlpy, as of NumPy's legacy generator."""
 STOP_AFTER = 2
 """Evaluations in a row that must reach `Settings.stop_at`."""
 

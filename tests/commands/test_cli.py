@@ -256,6 +256,35 @@ def test_an_output_folder_that_cannot_be_made_is_refused(arguments, place, tmp_p
     assert "--out" in fails(capsys, *arguments, "--out", place)
 
 
+@pytest.mark.parametrize("place", [".", "link", "dangling"])
+@pytest.mark.parametrize("command", ["record-demos", "render-demos"])
+def test_a_folder_that_nothing_can_be_renamed_to_is_refused(command, place, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "link").symlink_to("empty")
+    (tmp_path / "dangling").symlink_to("nowhere")
+    os.chdir("empty" if place == "." else tmp_path)
+    line = fails(capsys, command, "--episodes", "1", "--workers", "1", "--out", place)
+    assert "cannot be replaced" in line
+    left = sorted(path.name for path in tmp_path.rglob("*"))
+    assert left == ["dangling", "empty", "link"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("evaluate zero --video-of failures", "--video-of goes with --video"),
+        ("evaluate zero --video-size 64", "--video-size goes with --video"),
+        ("scene --film a.png --looks b.png", "--film and --looks are given"),
+        ("saliency zero --step 1.5", "expected a whole number, got '1.5'"),
+        ("policy tune h.yaml --patience 1.5,2.4", "expected a whole number, got '1.5'"),
+        ("robot serve --seconds inf", "1000000"),
+        ("cache prune --keep nope", "There is no dataset nope"),
+    ],
+)
+def test_what_would_be_ignored_or_rounded_is_refused(words, said, capsys):
+    assert said in fails(capsys, *words.split())
+
+
 def test_an_unwritable_sheet_is_refused(capsys):
     assert "cannot be written" in fails(capsys, "scene", "--sheet", "/proc/sheet.png")
 

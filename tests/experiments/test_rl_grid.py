@@ -71,6 +71,7 @@ def test_a_whole_procedure_shares_the_actors_of_its_seed(tmp_path):
         ({"change": {"graps": ["gamma=0.9"]}}, UnknownName),
         ({"hierarchical": True}, InputError),
         ({"env_steps": 0}, InputError),
+        ({"seed": (0, 2**32)}, InputError),
         ({"noise": 2.0}, InputError),
     ],
 )

@@ -16,7 +16,7 @@ from told_clock import Clock
 
 from surgicai_vision import envs
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.imports.drive_log import import_drive_log
@@ -572,6 +572,12 @@ def test_the_tip_is_kept_in_the_workspace_and_the_jaw_still_moves():
 def test_guards_have_no_switch(limits):
     with pytest.raises(InputError):
         GuardConfig(**limits)
+
+
+@pytest.mark.parametrize("low", [[], [0.0], [0.0] * 4])
+def test_a_box_has_three_sides(low):
+    with pytest.raises(InputError, match="expected 3 values"):
+        from_mapping(GuardConfig, {"low": low, "high": [0.4] * len(low)})
 
 
 def test_a_robot_must_be_given_its_own_workspace():

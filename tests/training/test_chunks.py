@@ -1,5 +1,7 @@
 """Chunks of actions: their column, their policies, and how they are executed."""
 
+import datetime
+import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -423,6 +425,12 @@ def test_a_change_may_be_one_entry_of_a_table(tmp_path: Path, registered: None) 
             load_recipe("linear", path, {"chunk": 12, key: 3})
     with pytest.raises(UnknownName, match="settings"):
         load_recipe("linear", path, {"setings.depth": 3})
+
+
+@pytest.mark.parametrize("value", [math.nan, [1.0, math.inf], datetime.date(2020, 1, 1), {1j: 2}])
+def test_settings_that_no_file_can_hold_are_refused(value: object) -> None:
+    with pytest.raises(InputError, match="dropout"):
+        replace(QUICK, settings={"dropout": value})
 
 
 def test_no_tensor_is_left_where_the_policy_was() -> None:

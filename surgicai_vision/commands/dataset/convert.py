@@ -54,7 +54,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     ending = "-".join(part for part in ("+".join(options.view or ()), options.video) if part)
     if not ending:
         raise InputError("There is nothing to do: give --view VIEW[,VIEW], --video CODEC or both.")
-    out = options.out or path.with_name(f"{path.name}-{ending}")
+    whole = path.absolute()
+    out = options.out or whole.with_name(f"{whole.name}-{ending}")
     summary = convert_dataset(
         path,
         out,

@@ -13,6 +13,7 @@ from surgicai_vision.commands.options import (
     DIRECTORY,
     SEED,
     UNIQUE,
+    WHOLE_NUMBERS,
     AcceptLicence,
     EnvFields,
     EvaluationWorkers,
@@ -52,7 +53,7 @@ class Options:
 
     policy: Annotated[Path, Parameter(metavar="FILE")] = field(kw_only=False)
     confidence: Annotated[tuple[float, ...], UNIQUE, Parameter(metavar="P[,P]")] = CONFIDENCES
-    patience: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = PATIENCES
+    patience: Annotated[tuple[int, ...], WHOLE_NUMBERS] = PATIENCES
     episodes: Annotated[int, COUNT] = 20
     seed: Annotated[int, SEED] = names.VALIDATION_SEED
     workers: EvaluationWorkers = None

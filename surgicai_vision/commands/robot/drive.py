@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter, validators
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
@@ -14,6 +14,7 @@ from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
+    DURATION,
     FILE_ONLY,
     SEED,
     AcceptLicence,
@@ -97,9 +98,7 @@ class Options:
     ] = None
     episodes: Annotated[int, COUNT] = 1
     seed: Annotated[int, SEED] = names.TEST_SEED
-    seconds: Annotated[
-        float | None, Parameter(validator=validators.Number(gt=0)), default_text("the task's own")
-    ] = None
+    seconds: Annotated[float | None, DURATION, default_text("the task's own")] = None
     compressed: bool = False
     transport: Annotated[str, TRANSPORT] = "cyclonedds"
     interface: Annotated[str, INTERFACE] = "lo"

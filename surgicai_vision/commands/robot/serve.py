@@ -12,6 +12,7 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
     DIRECTORY,
+    DURATION,
     FILE_ONLY,
     IMAGE_SIZE,
     SEED,
@@ -83,9 +84,7 @@ class Options:
     transport: Annotated[str, TRANSPORT] = "cyclonedds"
     interface: Annotated[str, INTERFACE] = "lo"
     domain: Domain = None
-    seconds: Annotated[
-        float | None, Parameter(validator=validators.Number(gt=0)), default_text("until Ctrl-C")
-    ] = None
+    seconds: Annotated[float | None, DURATION, default_text("until Ctrl-C")] = None
     env: EnvFields = None
     topics: Annotated[dict[str, object] | None, FILE_ONLY] = None
 

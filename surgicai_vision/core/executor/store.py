@@ -12,7 +12,7 @@ from pathlib import Path
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.executor.context import RunContext
 from surgicai_vision.core.executor.jobs import Job, Task
-from surgicai_vision.core.files import TEMPORARY, locked, sync_folder
+from surgicai_vision.core.files import TEMPORARY, check_renamed, locked, sync_folder
 from surgicai_vision.core.progress import Progress, silent
 
 Ended = Callable[[Job, Path, SurgicaiError | None], None]
@@ -97,7 +97,8 @@ def claim(store: Path) -> Iterator[None]:
 
 def work_folder(out: Path) -> Path:
     """Return the store in which `out` is built: next to it, on the same file system."""
-    return out.with_name(f"{out.name}.work")
+    whole = out.absolute()
+    return whole.with_name(f"{whole.name}.work")
 
 
 @contextmanager
@@ -111,7 +112,11 @@ def building(out: Path) -> Iterator[tuple[Path, Path]]:
         with building(out) as (store, result):
             shards = run(jobs, store, context)
             with whole_folder(result) as folder: …
+
+    Raises:
+        InputError: nothing can be renamed to `out` (`files.check_renamed`).
     """
+    check_renamed(out)
     store = work_folder(out)
     try:
         with claim(store):

@@ -26,13 +26,13 @@ from dataclasses import dataclass, field, replace
 from surgicai_vision.core import names
 from surgicai_vision.core.banks import BANKS
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, read_changes, to_mapping
-from surgicai_vision.core.errors import InputError, check_at_least, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_at_most, check_name
 from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrations
 from surgicai_vision.experiments.sweep.experiment import Evaluated, Training, check_runs
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.rl.high_level_config import DECISIONS
-from surgicai_vision.rl.settings import OBSERVATIONS, settings_of
+from surgicai_vision.rl.settings import LARGEST_SEED, OBSERVATIONS, settings_of
 from surgicai_vision.training.run_config import RunConfig, Starts
 
 RECIPE = "rl"
@@ -106,6 +106,7 @@ class RLGrid:
             demonstrations=min(self.demonstrations, default=None),
         )
         check_at_least(0, validation=self.validation)
+        check_at_most(LARGEST_SEED, seed=max(self.seed))
         if self.hierarchical and set(self.task) != set(names.SUBTASKS):
             raise InputError(
                 f"hierarchical needs all of {', '.join(names.SUBTASKS)}; task is "

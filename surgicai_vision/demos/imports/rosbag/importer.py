@@ -24,7 +24,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, UnreachablePose, check_name
 from surgicai_vision.core.executor import building
-from surgicai_vision.core.files import check_output, sha256_file, whole_folder
+from surgicai_vision.core.files import check_output, check_renamed, sha256_file, whole_folder
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.demos.imports.replay import Replay, Track, fitting_step, motion_actions
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
@@ -152,6 +152,7 @@ def check_folders(out: Path, task: str | None) -> None:
     """
     for folder in [out] if task else [out / name for name in names.SUBTASKS]:
         check_output(folder, may_resume=MARKER)
+        check_renamed(folder)
 
 
 def write_tracks(
