@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -275,14 +275,25 @@ def _pages(content: Content, position: int) -> Iterator[_Page]:
     for _ in itertools.count():
         try:
             header, body = read_struct(content, position)
-            kind, size, stored = (header[number][1] for number in (1, 2, 3))
-            values = header[VALUE_COUNTS[kind]][1][1][1]
+            kind, size, stored = (_number(header, field) for field in (1, 2, 3))
+            values = _number(header[VALUE_COUNTS[PageType(kind)]][1], 1)
         except (ValueError, KeyError, TypeError, IndexError):
             return
         if min(size, stored, values) < 0 or body + stored > len(content):
             return
         yield _Page(position, body + stored, kind, values, size + body - position)
         position = body + stored
+
+
+def _number(fields: Fields, field: int) -> int:
+    """Return a field of a page's header; all that are read are 32-bit numbers.
+
+    A complete footer, which can follow the last page, has other types in these fields.
+    """
+    kind, value = fields[field]
+    if kind != thrift.I32:
+        raise ValueError(f"type {kind}")
+    return cast(int, value)
 
 
 def _group(model: Fields, chunks: list[_Column], rows: int, number: int) -> Fields:

@@ -13,12 +13,12 @@ import ctypes
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_salvage.check import check_dataset
-from lerobot_salvage.verify import Verified, Verifier, claimed_episodes
+from lerobot_salvage.verify import Verified, Verifier, claimed_episodes, task_name
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, SurgicaiError
 from surgicai_vision.core.executor import claim, work_folder
@@ -121,11 +121,13 @@ def _write(
     features = {key: row for key, row in files.features.items() if key not in INDEX_FEATURES}
     rows: list[EpisodeMetadata] = []
     digests: list[str] = []
+    tasks = dict(files.tasks)
     with whole_folder(made) as folder, tempfile.TemporaryDirectory(dir=scratch) as mended:
         data = DataFiles(folder, features, files.fps)
         for episode in verifier.episodes(Path(mended)):
             rows.append(_append(data, len(rows), episode))
             digests.append(episode.digest)
+            tasks.update(episode.tasks)
             progress(len(rows), max(claimed, len(rows)), "episodes")
         data.close()
         if not rows:
@@ -137,40 +139,35 @@ def _write(
                 target = folder / video_path(key, number)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(videos[number], target)
-        texts = _texts(files.tasks, rows)
+        texts = [tasks.get(index, task_name(index)) for index in range(max(tasks) + 1)]
         write_metadata(folder, features, texts, rows, files.info)
-        if verifier.ours:
-            write_json(folder / names.META_FILE, _meta(verifier.ours, rows, digests, claimed))
+        if verifier.meta:
+            digest = schema.dataset_digest(digests) if verifier.ours else None
+            write_json(folder / names.META_FILE, _meta(verifier.meta, rows, digest, claimed))
     return rows
 
 
 def _append(data: DataFiles, number: int, episode: Verified) -> EpisodeMetadata:
     """Write one episode."""
     row = data.append(number, episode.table, episode.statistics)
-    return EpisodeMetadata(
-        row.start, row.stop, row.file, row.statistics, episode.tasks, episode.videos
-    )
-
-
-def _texts(tasks: Mapping[int, str], rows: Sequence[EpisodeMetadata]) -> list[str]:
-    """Return the sentence of every task index."""
-    if tasks:
-        return [tasks.get(index, f"task {index}") for index in range(max(tasks) + 1)]
-    named = {text for row in rows for text in row.tasks}
-    return [f"task {index}" for index in range(len(named))]
+    texts = tuple(episode.tasks.values())
+    return EpisodeMetadata(row.start, row.stop, row.file, row.statistics, texts, episode.videos)
 
 
 def _meta(
-    ours: Table, rows: Sequence[EpisodeMetadata], digests: Sequence[str], claimed: int
+    before: Table, rows: Sequence[EpisodeMetadata], digest: str | None, claimed: int
 ) -> Table:
-    """Return `meta/surgicai.json` of the prefix, which is no longer the result of a request."""
+    """Return `meta/surgicai.json` of the prefix, which is no longer the result of a request.
+
+    Its digest is None where it is not known: in a layout other than surgicai-vision's own.
+    """
     return {
-        **ours,
+        **before,
         "request": None,
-        "repaired": {"episodes_before": claimed, "digest_before": ours.get("digest")},
+        "repaired": {"episodes_before": claimed, "digest_before": before.get("digest")},
         "frames": rows[-1].stop,
         "episodes": len(rows),
-        "digest": schema.dataset_digest(digests),
+        "digest": digest,
     }
 
 

@@ -6,7 +6,7 @@
 
 An episode is whole if its rows are in order and finite, every image decodes to the size given by
 its feature, and every video contains the episode's frames. An episode that surgicai-vision rendered
-must also pass the rules of that package (`surgicai_vision.dataset.rules`).
+in its own layout must also pass the rules of that package (`surgicai_vision.dataset.rules`).
 """
 
 import functools
@@ -23,8 +23,9 @@ from lerobot_salvage.recovery import open_or_recover
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, first_line
 from surgicai_vision.core.files import read_json
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset import codecs, schema
-from surgicai_vision.dataset.lerobot_files import LeRobotFiles
+from surgicai_vision.dataset.lerobot_files import MOST_TASKS, LeRobotFiles
 from surgicai_vision.dataset.metadata import Features, row_statistics
 from surgicai_vision.dataset.rules import ImageWatch, episode_problems, number_problems
 from surgicai_vision.dataset.schema import Table
@@ -39,14 +40,14 @@ class Verified:
     Attributes:
         table: its rows, with every image's bytes.
         statistics: its statistics by feature.
-        tasks: sentences of its tasks.
+        tasks: task index → its sentence, in the order of the indices.
         videos: feature → (file number, start [s], end [s]).
-        digest: digest of the content, if surgicai-vision rendered it; else "".
+        digest: digest of the content, if surgicai-vision rendered it in its own layout; else "".
     """
 
     table: pa.Table
     statistics: Mapping[str, Statistics]
-    tasks: tuple[str, ...]
+    tasks: Mapping[int, str]
     videos: Mapping[str, tuple[int, float, float]]
     digest: str
 
@@ -60,13 +61,15 @@ class Verifier:
 
     Attributes:
         files: the dataset's files; the reason why the episodes end is added to its problems.
-        ours: content of `meta/surgicai.json`; empty for datasets from other sources.
+        meta: content of `meta/surgicai.json`; empty for datasets from other sources.
+        ours: the same; also empty for a layout other than surgicai-vision's own.
         video_files: feature → its videos.
     """
 
     def __init__(self, files: LeRobotFiles):
         self.files = files
-        self.ours = _ours(files.path)
+        self.meta = rendered_meta(files.path)
+        self.ours = {} if "layout" in self.meta else self.meta
         self.video_files = {
             key: sorted(files.path.glob(f"videos/{key}/chunk-*/file-*.mp4"))
             for key in files.video_keys
@@ -112,14 +115,12 @@ class Verifier:
             statistics[key] = seen or known.get(key) or self.files.statistics.get(key) or {}
             if not statistics[key]:
                 del statistics[key]
-        texts = {
-            index: self.files.tasks.get(index, f"task {index}")
-            for index in columns["task_index"].tolist()
+        tasks = {
+            index: self.files.tasks.get(index, task_name(index))
+            for index in np.unique(columns["task_index"]).tolist()
         }
         content = digest.hexdigest(columns, self.ours["views"]) if self.ours else ""
-        return Verified(
-            table, statistics, tuple(texts[index] for index in sorted(texts)), videos, content
-        )
+        return Verified(table, statistics, tasks, videos, content)
 
     def _plain(self, table: pa.Table) -> list[str]:
         return [name for name in table.column_names if name not in self.files.image_keys]
@@ -154,6 +155,9 @@ class Verifier:
         for key, column in columns.items():
             if column.dtype.kind == "f" and not np.isfinite(column).all():
                 raise _Unfit(f"{key} holds numbers that are not finite.")
+        tasks = columns["task_index"]
+        if tasks.dtype.kind not in "iu" or not 0 <= tasks.min() <= tasks.max() < MOST_TASKS:
+            raise _Unfit(f"its task_index is not a whole number from 0 to {MOST_TASKS - 1}.")
         rows = self.files.rows
         if number < len(rows) and rows[number].get("length") != count:
             raise _Unfit(
@@ -274,13 +278,22 @@ def claimed_episodes(files: LeRobotFiles) -> int:
     return claimed if isinstance(claimed, int) else 0
 
 
-def _ours(path: Path) -> Table:
-    """Return the content of `meta/surgicai.json`; empty if it cannot be read."""
+def task_name(index: int) -> str:
+    """Return the sentence of a task whose own is lost."""
+    return f"task {index}"
+
+
+def rendered_meta(path: Path) -> Table:
+    """Return the content of `meta/surgicai.json`; empty if it is missing or damaged.
+
+    It names a `layout` unless the dataset has surgicai-vision's own columns.
+    """
     try:
-        meta = read_json(path / names.META_FILE)
-        return meta if {"views", "depth", "segmentation", "image_size"} <= set(meta) else {}
-    except (BadFile, TypeError):
+        meta = checked(read_json(path / names.META_FILE), dict, names.META_FILE)
+    except BadFile:
         return {}
+    whole = "layout" in meta or {"views", "depth", "segmentation", "image_size"} <= set(meta)
+    return meta if whole else {}
 
 
 def _contents(column: pa.ChunkedArray) -> list[tuple[bytes | None, str | None]]:

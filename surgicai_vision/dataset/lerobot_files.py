@@ -9,7 +9,8 @@ and reading ends where the data does.
 """
 
 import itertools
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import cast
 
@@ -18,6 +19,7 @@ import pyarrow.parquet as pq
 
 from surgicai_vision.core.errors import BadFile, first_line
 from surgicai_vision.core.files import read_json
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset.metadata import INDEX_FEATURES, arrow_schema
 from surgicai_vision.dataset.schema import Table
 
@@ -29,7 +31,16 @@ EPISODES = "meta/episodes/chunk-*/file-*.parquet"
 VERSIONS = ("v3.0", "v3.1")
 type OpenFile = Callable[[Path], pq.ParquetFile]
 """Opens a data file; lerobot_salvage passes one that recovers a file without a footer."""
-UNREADABLE = (OSError, KeyError, ValueError, TypeError, pa.ArrowException)
+MOST_AXES = 5
+"""Axes of a feature's shape; more are not supported by LeRobot (lerobot 0.6.1, Array5D)."""
+MOST_ELEMENTS = 2**25
+"""Most numbers of a feature in one frame, and of all features together that are not images.
+
+An RGB image in 4K (3,840 × 2,160) has three quarters of it.
+"""
+MOST_TASKS = 1_000_000
+"""Most tasks of a dataset."""
+UNREADABLE = (OSError, KeyError, ValueError, TypeError, OverflowError, pa.ArrowException)
 
 
 class LeRobotFiles:
@@ -60,14 +71,14 @@ class LeRobotFiles:
         self.problems: list[str] = []
         try:
             self.features = {
-                str(key): {**row, "shape": tuple(int(side) for side in row["shape"])}
-                for key, row in self.info["features"].items()
+                str(key): _feature(str(key), row) for key, row in self.info["features"].items()
             }
+            _check_numbers(self.features)
             self.fps = float(self.info["fps"])
             own = {key: row for key, row in self.features.items() if key not in INDEX_FEATURES}
             self.schema = arrow_schema(own)
             version = self.info["codebase_version"]
-        except (KeyError, TypeError, ValueError, AttributeError, pa.ArrowException) as error:
+        except (*UNREADABLE, AttributeError, BadFile) as error:
             raise BadFile(
                 f"{self.path / INFO} does not describe a LeRobot dataset ({first_line(error)})."
             ) from None
@@ -105,7 +116,10 @@ class LeRobotFiles:
             pairs = zip(
                 table.column("task_index").to_pylist(), table.column(name).to_pylist(), strict=True
             )
-            return {int(index): str(text) for index, text in pairs}
+            tasks = {int(index): str(text) for index, text in pairs}
+            if tasks and not 0 <= min(tasks) <= max(tasks) < MOST_TASKS:
+                raise ValueError(f"a task_index is not within 0 and {MOST_TASKS - 1}")
+            return tasks
         except UNREADABLE as error:
             self.problems.append(f"{TASKS} cannot be read ({first_line(error)}).")
             return {}
@@ -165,6 +179,28 @@ class LeRobotFiles:
             except UNREADABLE as error:
                 self.problems.append(f"{name} cannot be read further ({first_line(error)}).")
                 return
+
+
+def _feature(key: str, row: Table) -> Table:
+    """Return a feature with its shape as a tuple; refuse a shape or an `info` that cannot be."""
+    shape = tuple(int(side) for side in row["shape"])
+    fits = 1 <= len(shape) <= MOST_AXES and min(shape) >= 1
+    if not fits or math.prod(shape) > MOST_ELEMENTS:
+        raise ValueError(
+            f"the shape of {key} must be 1 to {MOST_AXES} positive numbers whose product is at "
+            f"most {MOST_ELEMENTS}"
+        )
+    if row.get("info") is not None:
+        checked(row["info"], dict, f"info of {key}")
+    return {**row, "shape": shape}
+
+
+def _check_numbers(features: Mapping[str, Table]) -> None:
+    """Refuse a row that is too large; an image is stored encoded, whatever its shape."""
+    plain = [row["shape"] for row in features.values() if row["dtype"] not in ("image", "video")]
+    count = sum(math.prod(shape) for shape in plain)
+    if count > MOST_ELEMENTS:
+        raise ValueError(f"a frame has {count} numbers besides images; at most {MOST_ELEMENTS}")
 
 
 def _number(table: pa.Table) -> int:

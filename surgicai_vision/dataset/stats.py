@@ -21,27 +21,31 @@ Statistics = dict[str, list[Any]]
 
 
 class ImageStatistics:
-    """Running statistics of one image column: (H, W, 3) uint8 or (H, W, 1) float32 frames."""
+    """Running statistics of one image column: (H, W, channels) frames, uint8 or float32 [m]."""
 
     def __init__(self) -> None:
         self._count = 0
-        self._histogram = np.zeros((3, 256))
+        self._histogram = np.zeros((1, 256))
         self._depths: list[NDArray[np.float32]] = []
 
     def add(self, frame: NDArray[np.uint8 | np.float32]) -> None:
         """Add one frame."""
         self._count += 1
         if frame.dtype == np.uint8:
-            for channel in range(3):
-                counts = cv2.calcHist([frame], [channel], None, [256], [0, 256])
-                self._histogram[channel] += counts.ravel()
+            counts = [
+                cv2.calcHist([frame], [channel], None, [256], [0, 256]).ravel()
+                for channel in range(frame.shape[2])
+            ]
+            self._histogram = self._histogram + np.stack(counts)  # one row per channel
         else:
-            self._depths.append(frame[::DEPTH_STRIDE, ::DEPTH_STRIDE].ravel().astype(np.float32))
+            part = frame[::DEPTH_STRIDE, ::DEPTH_STRIDE].astype(np.float32)
+            self._depths.append(part.reshape(-1, frame.shape[2]))
 
     def result(self) -> Statistics:
         """Return the statistics, each of shape (channels, 1, 1); the count is (1,)."""
         if self._depths:
-            channels = [_column_statistics(np.concatenate(self._depths).astype(np.float64))]
+            depths = np.concatenate(self._depths).astype(np.float64)
+            channels = [_column_statistics(column) for column in depths.T]
         else:
             channels = [_histogram_statistics(row) for row in self._histogram]
         table: Statistics = {name: [[[row[name]]] for row in channels] for name in channels[0]}

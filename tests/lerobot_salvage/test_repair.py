@@ -8,6 +8,7 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -26,6 +27,8 @@ from surgicai_vision.core.executor import RunContext, work_folder
 from surgicai_vision.core.executor.store import LOCK
 from surgicai_vision.core.files import locked
 from surgicai_vision.dataset import codecs, render_demos
+from surgicai_vision.dataset.lerobot_files import TASKS, LeRobotFiles
+from surgicai_vision.dataset.stats import ImageStatistics
 
 CAMERA, DATA = "observation.images.cam", "data/chunk-000/file-000.parquet"
 LENGTHS = (6, 4, 5)
@@ -149,9 +152,13 @@ def test_a_video_dataset_is_repaired_by_counting_its_frames(tmp_path):
 
 
 def change(path, column, row, value):
-    table = pq.read_table(path)
-    values = table.column(column).to_pylist()
+    values = pq.read_table(path).column(column).to_pylist()
     values[row] = value
+    replace(path, column, values)
+
+
+def replace(path, column, values):
+    table = pq.read_table(path)
     field = table.field(column)
     table = table.set_column(
         table.schema.get_field_index(column), field, pa.array(values, field.type)
@@ -178,6 +185,12 @@ def torn(folder):
     path.write_bytes(path.read_bytes()[: start + 3000])
 
 
+def unfinished(folder):
+    """The last eight bytes are missing: the footer is there, but not where it is."""
+    path = folder / DATA
+    path.write_bytes(path.read_bytes()[:-8])
+
+
 def counts_in_words(folder):
     info = json.loads((folder / "meta/info.json").read_text())
     info["total_episodes"] = "many"
@@ -189,6 +202,7 @@ DAMAGE = {
     "no number counted": (counts_in_words, 3, "it counts many episodes"),
     "rows missing": (fewer_rows, 3, "rows do not match the episodes"),
     "torn": (torn, 2, "no footer"),
+    "unfinished": (unfinished, 3, "no footer"),
     "image spoilt": (
         lambda f: change(f / DATA, CAMERA, 8, {"bytes": b"no", "path": "x"}),
         1,
@@ -211,7 +225,10 @@ DAMAGE = {
         3,
         "stats.json is not valid JSON",
     ),
-    "tasks": (lambda f: (f / "meta/tasks.parquet").unlink(), 3, "tasks.parquet cannot be read"),
+    "tasks": (lambda f: (f / TASKS).unlink(), 3, "tasks.parquet cannot be read"),
+    "task index": (lambda f: change(f / TASKS, "task_index", 1, 10**12), 3, "not within 0 and"),
+    "task of a frame": (lambda f: change(f / DATA, "task_index", 8, 10**12), 1, "its task_index"),
+    "task below 0": (lambda f: change(f / DATA, "task_index", 8, -1), 1, "its task_index"),
 }
 
 
@@ -230,6 +247,82 @@ def test_the_longest_whole_prefix_of_a_foreign_dataset_is_kept(tmp_path, foreign
     assert mended.num_episodes == kept
     if name != "tasks":
         same_items(mended, opened(foreign / "whole"), sum(LENGTHS[:kept]))
+
+
+@pytest.mark.parametrize("spoil", [lambda f: None, DAMAGE["tasks"][0]], ids=["kept", "lost"])
+def test_every_task_index_of_the_data_gets_a_task(tmp_path, foreign, spoil):
+    folder = shutil.copytree(foreign / "whole", tmp_path / "set")
+    change(folder / DATA, "task_index", 5, 3)
+    spoil(folder)
+    problems = check_dataset(folder).problems
+    assert any("no task for" in problem for problem in problems), problems
+    assert repair_dataset(folder).episodes == 3
+    assert check_dataset(folder).problems == ()
+    mended = opened(folder)
+    assert mended.meta.total_tasks == 4
+    assert [mended[index]["task"] for index in (4, 5, 6)] == ["task 0", "task 3", "task 1"]
+
+
+def describe(folder, key, **changes):
+    """Change what `info.json` says of a feature."""
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["features"][key].update(changes)
+    (folder / "meta/info.json").write_text(json.dumps(info))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"shape": [2_000_000_000]}, "the shape of observation.state"),
+        ({"shape": [100_000, 100_000]}, "the shape of observation.state"),
+        ({"shape": [0]}, "the shape of observation.state"),
+        ({"shape": [-2, -2]}, "the shape of observation.state"),
+        ({"shape": []}, "the shape of observation.state"),
+        ({"shape": [1] * 2000}, "the shape of observation.state"),
+        ({"shape": [float("inf")]}, "infinity"),
+        ({"shape": [2**25]}, "numbers besides images"),
+        ({"info": "x"}, "info of observation.state is 'x'"),
+    ],
+)
+def test_a_feature_that_cannot_be_is_refused(tmp_path, foreign, changes, said):
+    folder = shutil.copytree(foreign / "killed", tmp_path / "set")
+    describe(folder, names.STATE, **changes)
+    for work in (check_dataset, repair_dataset):
+        with pytest.raises(BadFile, match=f"does not describe a LeRobot dataset.*{said}"):
+            work(folder)
+
+
+def test_large_images_and_an_empty_info_are_allowed(tmp_path, foreign):
+    folder = shutil.copytree(foreign / "killed", tmp_path / "set")
+    describe(folder, CAMERA, shape=[2160, 3840, 3], info=None)
+    assert LeRobotFiles(folder).features[CAMERA]["shape"] == (2160, 3840, 3)
+
+
+def test_grey_images_are_checked_and_repaired(tmp_path, foreign):
+    folder = shutil.copytree(foreign / "whole", tmp_path / "set")
+    frames = np.random.default_rng(1).integers(0, 256, (sum(LENGTHS), 48, 64, 1), dtype=np.uint8)
+    images = [cv2.imencode(".png", frame)[1].tobytes() for frame in frames]
+    replace(folder / DATA, CAMERA, [{"bytes": image, "path": "x"} for image in images])
+    describe(folder, CAMERA, shape=[48, 64, 1])
+    assert check_dataset(folder).problems == ()
+    counts_more(folder)
+    assert repair_dataset(folder).episodes == 3
+    mended = opened(folder)
+    np.testing.assert_allclose(mended.meta.stats[CAMERA]["mean"], [[[frames.mean() / 255]]])
+    np.testing.assert_allclose(mended[7][CAMERA].numpy(), frames[7, ..., 0][None] / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_statistics_have_the_channels_of_the_images(channels, dtype):
+    statistics = ImageStatistics()
+    frame = np.broadcast_to(np.arange(channels), (8, 8, channels)).astype(dtype)
+    statistics.add(frame)
+    statistics.add(frame)
+    scale = 255 if dtype == np.uint8 else 1
+    np.testing.assert_allclose(
+        statistics.result()["max"], np.arange(channels)[:, None, None] / scale
+    )
 
 
 def test_images_beside_the_data_are_taken_in(tmp_path, foreign):
@@ -274,6 +367,36 @@ def test_a_second_repair_is_refused_and_leaves_the_first_ones_work(tmp_path, for
     assert (work / "half").read_text() == "of the first"
     assert repair_dataset(folder).episodes == 3, "the first one was killed"
     assert not work.exists()
+
+
+def test_a_dataset_in_another_layout_is_treated_as_anyones(tmp_path, foreign):
+    folder = shutil.copytree(foreign / "whole", tmp_path / "set")
+    meta = {
+        "format": 3,
+        "layout": "open-h",
+        "request": {"size": 48},
+        "views": ["back"],
+        "depth": False,
+        "segmentation": False,
+        "image_size": 48,
+        "frames": sum(LENGTHS),
+        "episodes": 3,
+        "digest": "0" * 64,
+    }
+    (folder / names.META_FILE).write_text(json.dumps(meta))
+    assert check_dataset(folder).problems == ()
+    assert repair_dataset(folder).original is None
+    DAMAGE["image spoilt"][0](folder)
+    assert repair_dataset(folder).episodes == 1
+    assert check_dataset(folder).problems == ()
+    assert json.loads((folder / names.META_FILE).read_text()) == {
+        **meta,
+        "request": None,
+        "repaired": {"episodes_before": 3, "digest_before": meta["digest"]},
+        "frames": LENGTHS[0],
+        "episodes": 1,
+        "digest": None,
+    }
 
 
 @pytest.fixture
