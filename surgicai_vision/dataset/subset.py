@@ -106,10 +106,8 @@ def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
 
 def _since_visit(dataset: Dataset, rows: NDArray[np.int64]) -> dict[str, NDArray[np.generic]]:
     """Return `frame_index` and `timestamp` of some rows, counted from their visit's beginning."""
-    whole, places = dataset, rows
-    while isinstance(whole, DatasetSubset):
-        places = whole.rows[places]
-        whole = whole.whole
+    whole = whole_of(dataset)
+    places = rows_in_whole(dataset)[rows]
     columns = whole.columns()
     first = first_of_visit(np.asarray(columns[names.PHASE]), np.asarray(whole.episode_index))
     return {
@@ -123,6 +121,15 @@ def whole_of(dataset: Dataset) -> Dataset:
     while isinstance(dataset, DatasetSubset):
         dataset = dataset.whole
     return dataset
+
+
+def rows_in_whole(dataset: Dataset) -> NDArray[np.int64]:
+    """Return the rows of a dataset's frames in the dataset of `whole_of`, (N,)."""
+    rows = np.arange(dataset.length)
+    while isinstance(dataset, DatasetSubset):
+        rows = dataset.rows[rows]
+        dataset = dataset.whole
+    return rows
 
 
 def first_of_visit(

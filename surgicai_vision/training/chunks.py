@@ -24,7 +24,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.reader import RenderedDataset
-from surgicai_vision.dataset.subset import DatasetSubset, whole_of
+from surgicai_vision.dataset.subset import DatasetSubset, rows_in_whole, whole_of
 from surgicai_vision.demos.store import demos_digest, list_demos, read_demo
 
 BESIDE = "demos"
@@ -107,7 +107,7 @@ def with_chunks(dataset: Dataset, timeline: Timeline, offsets: Sequence[int]) ->
         timeline: from `timeline_of`.
         offsets: (T,) offsets of a chunk's actions, in control steps from the present one.
     """
-    present = timeline.step[_rows(dataset)]
+    present = timeline.step[rows_in_whole(dataset)]
     wanted = present[:, None] + np.asarray(offsets, np.int64)
     held = np.clip(wanted, timeline.first[present, None], timeline.last[present, None])
     is_pad = (wanted != held).astype(np.float32)
@@ -118,15 +118,6 @@ def with_chunks(dataset: Dataset, timeline: Timeline, offsets: Sequence[int]) ->
         {"chunks": " ".join(map(str, offsets))},
         added={names.ACTION_CHUNK: chunks},
     )
-
-
-def _rows(dataset: Dataset) -> NDArray[np.int64]:
-    """Return the rows of a dataset's frames in its root, (N,)."""
-    rows = np.arange(dataset.length)
-    while isinstance(dataset, DatasetSubset):
-        rows = dataset.rows[rows]
-        dataset = dataset.whole
-    return rows
 
 
 def _runs(
