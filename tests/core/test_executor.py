@@ -48,6 +48,13 @@ def test_results_come_in_order_whatever_the_workers(tmp_path):
     assert [path.name for path in inline] == [path.name for path in spawned]
 
 
+def test_few_jobs_share_the_processes_of_this_machine():
+    assert [RunContext(6).processes_each(jobs) for jobs in (1, 2, 4, 6, 9)] == [6, 3, 1, 1, 1]
+    assert RunContext(6).processes_each(0) == 6, "nothing is left to do"
+    assert RunContext(0).processes_each(1) == 1, "in this process"
+    assert RunContext(6, SlurmEngine()).processes_each(1) == 1, "its workers are elsewhere"
+
+
 def test_finished_jobs_are_not_done_again(tmp_path):
     log = tmp_path / "log"
     jobs = [

@@ -167,6 +167,7 @@ def test_an_actor_trained_before_is_counted_and_not_trained_again(tmp_path, monk
         to_mapping(run),
         str(tmp_path / "again"),
         {"grasp": str(before / "policy")},
+        processes=1,
         decisions=0,
         validation=0,
         save_every=4,

@@ -113,6 +113,23 @@ def test_a_killed_and_interrupted_sweep_ends_as_a_quiet_one(quiet, tmp_path):
     assert not (out / "work").exists()
 
 
+def test_a_sweep_of_one_run_shares_its_episodes_among_the_workers(tmp_path, monkeypatch):
+    grid = replace(BLIND, seed=(0,), demonstrations=(1,), episodes=3)
+    alone = sweep(grid, tmp_path / "alone")
+    asked = []
+    run_of = Jobs.run
+
+    def noted(self, run, processes=1):
+        asked.append(processes)
+        return run_of(self, run, processes)
+
+    monkeypatch.setattr(Jobs, "run", noted)
+    shared = sweep(grid, tmp_path / "shared", workers=4)
+    assert shared["digest"] == alone["digest"] and shared["done"] == 1
+    assert max(asked) == 2, "the other two do the reference"
+    assert counts(sweep(grid, tmp_path / "shared")) == (1, 0, 1, 0, 0, 0), "not part of the key"
+
+
 def test_a_finished_sweep_does_nothing(quiet):
     out, first = quiet
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}

@@ -6,7 +6,7 @@ from typing import final
 
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor.engine import Engine
-from surgicai_vision.core.executor.local import LOCAL
+from surgicai_vision.core.executor.local import LOCAL, LocalEngine
 from surgicai_vision.core.progress import Stage, silent_stage
 
 
@@ -33,3 +33,12 @@ class RunContext:
         """Return how many processes to start; there is work for `most` of them."""
         count = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
         return count if most is None else min(count, most)
+
+    def processes_each(self, jobs: int) -> int:
+        """Return how many processes one of `jobs` jobs may use, so that no core is idle.
+
+        Another engine's workers are elsewhere; there a job has one.
+        """
+        if not isinstance(self.engine, LocalEngine):
+            return 1
+        return max(1, self.processes() // max(1, jobs))

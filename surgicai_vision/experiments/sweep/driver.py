@@ -307,11 +307,19 @@ class _Sweep:
         return errors
 
     def do(self, to_do: Sequence[RunState]) -> None:
-        """Do the runs and the references, and file each as it ends."""
+        """Do the runs and the references, and file each as it ends.
+
+        Where there are fewer than processes, each run's episodes are shared among several.
+        """
+        live = [state for state in to_do if state.key not in self.errors]
+        references = sum(not self._is_filed_reference(run) for run in self.references)
+        each = self.context.processes_each(len(live) + references)
         placed = [
-            (self.jobs.run(state.run), _Place(run_folder(self.out, state.key), RESULT_FILE, state))
-            for state in to_do
-            if state.key not in self.errors
+            (
+                self.jobs.run(state.run, each),
+                _Place(run_folder(self.out, state.key), RESULT_FILE, state),
+            )
+            for state in live
         ]
         placed += [
             (self.jobs.reference(run), _Place(self._reference_folder(run), REFERENCE_FILE))

@@ -82,13 +82,17 @@ def train_and_evaluate(
     policies: Mapping[str, str],
     env: Table,
     procedure: Table,
+    processes: int,
     dataset: str,
     accept_licence: bool,
     device: str | None,
     command: str,
     environment: Mapping[str, str],
 ) -> None:
-    """Job "sweep-run": train a policy, or take those made before, and evaluate it."""
+    """Job "sweep-run": train a policy, or take those made before, and evaluate it.
+
+    The episodes run in `processes` processes.
+    """
     os.environ.update(environment)
     what = _run(run)
     weights = WeightsSource(accept_licence=accept_licence)
@@ -107,7 +111,7 @@ def train_and_evaluate(
         spec = _shifted(in_env(spec, env), what)
         about = {**spec.about, **about}
         with measured("evaluation", "steps"):
-            summary = evaluate_as(folder / "evaluation", spec, what, about)
+            summary = evaluate_as(folder / "evaluation", spec, what, about, processes)
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)
     write_json(folder / RESULT_FILE, {"run": run, "summary": summary, "seconds": seconds})
 
@@ -167,8 +171,10 @@ def _trained(
     return open_policy(policy, task=run.task, weights=weights)
 
 
-def evaluate_as(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) -> dict[str, JSON]:
-    """Evaluate `spec` in its env, named and stored as `run`.
+def evaluate_as(
+    folder: Path, spec: PolicySpec, run: RunConfig, about: Table, processes: int = 1
+) -> dict[str, JSON]:
+    """Evaluate `spec` in its env, named and stored as `run`, in `processes` processes.
 
     What is stored says if a policy within `spec`, such as an expert, sees the state with the goal.
     """
@@ -177,7 +183,7 @@ def evaluate_as(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) ->
     if spec.run.sees_goal and not stored.sees_goal:
         stored = dataclasses.replace(stored, privileged=True)
     spec = dataclasses.replace(spec, run=stored, about=about)
-    return evaluate_into(folder, spec, run.starts.seeds, workers=1)
+    return evaluate_into(folder, spec, run.starts.seeds, workers=processes)
 
 
 def _shifted(spec: PolicySpec, run: RunConfig) -> PolicySpec:

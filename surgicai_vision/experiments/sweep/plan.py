@@ -288,13 +288,14 @@ class Jobs:
         known = all(self.dataset_digest(name) for name in self.datasets_of(run))
         return self.run(run).key() if known else None
 
-    def run(self, run: RunConfig) -> Job:
+    def run(self, run: RunConfig, processes: int = 1) -> Job:
         """Return the job of a run.
 
-        It trains and evaluates, or evaluates policies made before.
+        It trains and evaluates, or evaluates policies made before, the episodes in `processes`
+        processes.
         """
         if run.algo:
-            return self._reinforcement(run)
+            return self._reinforcement(run, processes)
         parts = self.experiment.parts(run)
         dataset = self.datasets_of(run)[0]
         inputs = [self.policy(part).key() for part in parts.values()] or self._inputs(run, dataset)
@@ -306,9 +307,10 @@ class Jobs:
                 name: str(self.policy_folder(part).absolute()) for name, part in parts.items()
             },
             **to_mapping(evaluated),
+            "processes": processes,
             **self._common(dataset),
         }
-        return Job("sweep-run", arguments, tuple(inputs), label=(*LABELS, "final", "policies"))
+        return Job("sweep-run", arguments, tuple(inputs), label=RUN_LABELS)
 
     def policy(self, training: Training) -> Job:
         """Return the job that trains a policy that runs share."""
@@ -329,7 +331,7 @@ class Jobs:
         arguments = {"run": to_mapping(run), **self._learning(run)}
         return self._with_scratch(Job("sweep-actor", arguments, self._demos(run), label=RL_LABELS))
 
-    def _reinforcement(self, run: RunConfig) -> Job:
+    def _reinforcement(self, run: RunConfig, processes: int) -> Job:
         """Return the job that trains an actor, or PPO over actors made before, and evaluates it."""
         parts = self.experiment.parts(run)
         inputs = tuple(self.policy(part).key() for part in parts.values()) or self._demos(run)
@@ -339,6 +341,7 @@ class Jobs:
             "policies": {
                 name: str(self.policy_folder(part).absolute()) for name, part in parts.items()
             },
+            "processes": processes,
             **self._learning(run),
         }
         return self._with_scratch(Job("sweep-rl", arguments, inputs, label=RL_LABELS))
@@ -441,7 +444,8 @@ class Jobs:
 
 LABELS = ("dataset", "accept_licence", "device", "command", "environment")
 """Arguments that change where and how a job is done, but not its result."""
-RL_LABELS = (*LABELS, "final", "policies", "demos", "scratch")
+RUN_LABELS = (*LABELS, "final", "policies", "processes")
+RL_LABELS = (*RUN_LABELS, "demos", "scratch")
 LIBRARIES = ("stable_baselines3", "sb3_contrib", "d3rlpy")
 """What a sweep over algorithms imports."""
 

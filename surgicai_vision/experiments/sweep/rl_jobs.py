@@ -49,6 +49,7 @@ def train_and_evaluate(
     run: Table,
     final: str,
     policies: Mapping[str, str],
+    processes: int,
     decisions: int,
     validation: int,
     save_every: int,
@@ -81,7 +82,8 @@ def train_and_evaluate(
         if what.is_hierarchical:
             kept["hierarchical"] = {**policies, HLP: place, "termination": what.termination}
         with measured("evaluation", "steps"):
-            summary = evaluate_as(folder / "evaluation", spec, what, {**spec.about, **kept})
+            about = {**spec.about, **kept}
+            summary = evaluate_as(folder / "evaluation", spec, what, about, processes)
     write_json(folder / RESULT_FILE, {"run": run, "summary": summary, "seconds": seconds})
 
 
