@@ -10,6 +10,7 @@ from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker
 from surgicai_vision.experiments.plan_config import plan_of
+from surgicai_vision.experiments.sweep import driver
 from surgicai_vision.experiments.sweep.driver import run_sweep
 from surgicai_vision.experiments.sweep.plan import Jobs, plan
 from surgicai_vision.report.experiment_key import condition_of
@@ -143,3 +144,31 @@ def test_a_wrong_learner_is_refused(changed, told):
         demonstrations[1] = {**demonstrations[1], "episodes": 4000}
     with pytest.raises(InputError, match=told):
         plan_of({**TABLE, "demonstrations": demonstrations}, "a test")
+
+
+def test_other_policies_are_trained_beside_a_learner_and_come_out_the_same(tmp_path, monkeypatch):
+    table = {
+        **TABLE,
+        "demonstrations": [*TABLE["demonstrations"], {**SEEN, "name": "other", "task": "grasp"}],
+        "policies": [
+            *TABLE["policies"],
+            {"name": "other", "demonstrations": "other", "view": ["back"]},
+        ],
+        "conditions": [{"name": "all that act"}],
+    }
+    both = plan_of(table, "a test")
+    trained = []
+    train = driver._Sweep._train
+
+    def noted(self, policies):
+        asked = list(policies)
+        trained.append([policy.dataset.removeprefix("seed0/") for policy in asked])
+        return train(self, asked)
+
+    monkeypatch.setattr(driver._Sweep, "_train", noted)
+    alone = run_sweep(both, tmp_path / "alone", RunContext(0, stage=QuietConsole().stage))
+    assert trained == [["first"], ["second"], ["third", "other"]]
+    trained.clear()
+    beside = run_sweep(both, tmp_path / "beside", RunContext(2, stage=QuietConsole().stage))
+    assert trained == [["first", "other"], ["second"], ["third", "other"]]
+    assert beside["digest"] == alone["digest"] and beside["failed"] == 0

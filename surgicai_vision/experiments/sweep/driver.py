@@ -207,6 +207,8 @@ class _Sweep:
     errors: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     jobs: Jobs = field(init=False)
+    _made: set[str] = field(default_factory=set)
+    """Datasets made, or found whole, by this call."""
 
     def __post_init__(self) -> None:
         self._renew()
@@ -221,7 +223,8 @@ class _Sweep:
     def prepare(self, to_do: Sequence[RunState]) -> None:
         """Make the datasets, features and policies that runs share.
 
-        If a dataset fails, so do its runs.
+        If a dataset fails, so do its runs. Those that need a learner come last: beside it the
+        policies of the other datasets are trained.
         """
         users = {state.key: self.jobs.datasets_of(state.run) for state in to_do}
         replayed = [
@@ -230,9 +233,11 @@ class _Sweep:
             if run.policy == "replay" and not self._is_filed_reference(run)
         ]
         used = [name for state in to_do for name in users[state.key]]
-        for name in dict.fromkeys([*used, *replayed]):
+        parts = [part for state in to_do for part in self.experiment.parts(state.run).values()]
+        names = dict.fromkeys([*used, *replayed])
+        for name in sorted(names, key=lambda name: name in self.experiment.learners):
             try:
-                self._make_dataset(name)
+                self._make_dataset(name, parts)
             except SurgicaiError as error:
                 for state in to_do:
                     if name in users[state.key] and state.key not in self.errors:
@@ -242,8 +247,13 @@ class _Sweep:
         self._make_features(live)
         self._train_parts(live)
 
-    def _make_dataset(self, name: str) -> None:
+    def _make_dataset(self, name: str, parts: Sequence[Training]) -> None:
         """Make a dataset, and before it the policy that acts in its demonstrations, if one does.
+
+        Args:
+            name: the dataset's.
+            parts: policies that are needed later; those that can be trained while the learner is
+                use the processes that it leaves idle.
 
         Raises:
             SurgicaiError: the first thing that went wrong.
@@ -252,12 +262,31 @@ class _Sweep:
         learner = None
         if name in self.experiment.learners:
             policy = self.experiment.learners[name]
-            self._make_dataset(policy.dataset)
+            self._make_dataset(policy.dataset, parts)
             self._renew()  # the digest of what it is trained on is part of its key
-            for error in self._train([policy]).values():
-                raise error
+            if not self._is_filed(policy):
+                errors = self._train([policy, *self._beside(policy, parts)])
+                if error := errors.get(self.jobs.policy(policy).key()):
+                    raise error
             learner = learner_of(self.jobs.policy_folder(policy), dataset.env)
         make_dataset(dataset, self.jobs.data_folder(name), self.context, learner)
+        self._made.add(name)
+
+    def _beside(self, learner: Training, parts: Sequence[Training]) -> list[Training]:
+        """Return the policies to train beside a learner, at most one for each idle process.
+
+        Their datasets are made. Where policies share features, those are encoded first; such ones
+        are trained later.
+        """
+        ready = [
+            part
+            for part in dict.fromkeys(parts)
+            if part != learner
+            and part.dataset in self._made
+            and not part.encodes_all
+            and not self._is_filed(part)
+        ]
+        return ready[: max(0, self.context.processes() - 1)]
 
     def _run(
         self,
@@ -377,6 +406,10 @@ class _Sweep:
 
         if left:
             self._run(title, left, ended)
+
+    def _is_filed(self, policy: Training) -> bool:
+        place = _Place(self.jobs.policy_folder(policy), JOB_FILE)
+        return place.holds(self.jobs.policy(policy).key())
 
     def _is_filed_reference(self, run: RunConfig) -> bool:
         place = _Place(self._reference_folder(run), REFERENCE_FILE)
