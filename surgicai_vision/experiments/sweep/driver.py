@@ -16,19 +16,11 @@ from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.executor import Job, RunContext, claim
 from surgicai_vision.core.executor import run as run_jobs
-from surgicai_vision.evaluation.provenance import command_line, provenance
-from surgicai_vision.evaluation.storage import (
-    FAILED_FILE,
-    FORMAT,
-    GRID_FILE,
-    RESULT_FILE,
-    RUN_FILE,
-    Row,
-    parquet_bytes,
-    read_rows,
-)
+from surgicai_vision.evaluation.provenance import command_line
+from surgicai_vision.evaluation.storage import FAILED_FILE, FORMAT, GRID_FILE, RESULT_FILE, Row
 from surgicai_vision.experiments.dagger import learner_of
 from surgicai_vision.experiments.prepare import make_dataset
+from surgicai_vision.experiments.sweep.collect import EVALUATION, collect, collect_probes, store_run
 from surgicai_vision.experiments.sweep.experiment import Experiment, Training
 from surgicai_vision.experiments.sweep.plan import (
     CACHED,
@@ -44,15 +36,13 @@ from surgicai_vision.experiments.sweep.plan import (
     plan,
     read_experiment_of,
     run_folder,
-    run_key,
 )
 from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice
 from surgicai_vision.training.run_config import RunConfig
 
-EPISODES, PROBES = "episodes.parquet", "probes.parquet"
 WORK = "work"
-EVALUATION = "evaluation"
-"""Folder of a run's episodes, next to its result."""
+JOB_FILE = "job.json"
+"""Names the job that made a policy which runs share."""
 ATTEMPTS = 3
 """How often a run is started if its worker dies."""
 
@@ -111,9 +101,9 @@ def run_sweep(
         for state in to_do
         if state.key in sweep.errors
     ]
-    table = _collect(experiment, out)
-    _collect_probes(out)
-    _store_run(experiment, out, sweep.problems, skipped)
+    table = collect(experiment, out)
+    collect_probes(out)
+    store_run(experiment, out, sweep.problems, skipped)
     counts = {
         "runs": len(states),
         "done": len(to_do) - len(sweep.errors),
@@ -438,10 +428,6 @@ class _Sweep:
         self.errors[state.key] = " ".join(str(error).split())
 
 
-JOB_FILE = "job.json"
-"""Names the job that made a policy which runs share."""
-
-
 def _file(folder: Path, place: _Place, key: str) -> None:
     """Move a job's result to its place, its key in the record; what was there is replaced."""
     path = folder / place.record
@@ -452,59 +438,3 @@ def _file(folder: Path, place: _Place, key: str) -> None:
     files.sync_folder(place.folder.parent)
     # Filed, so the state from which a killed training would resume is no longer needed.
     shutil.rmtree(folder.parent.parent / TRAINING / key, ignore_errors=True)
-
-
-def _collect(experiment: Experiment, out: Path) -> list[Row]:
-    """Write `episodes.parquet` of all runs that are done and return its rows."""
-    table: list[Row] = []
-    for run in experiment.runs:
-        folder = run_folder(out, run_key(run))
-        if (folder / RESULT_FILE).exists():
-            about = _about(run)
-            table += [{**about, **row} for row in read_rows(folder / EVALUATION)]
-    files.write_bytes(out / EPISODES, parquet_bytes(table))
-    return table
-
-
-def _collect_probes(out: Path) -> None:
-    """Write `probes.parquet` of all probes there are, one row per encoder and view set."""
-    rows = [files.read_json(path) for path in sorted(out.glob(f"probes/*/{PROBE_FILE}"))]
-    if rows:
-        files.write_bytes(out / PROBES, parquet_bytes(rows))
-
-
-def _about(run: RunConfig) -> Row:
-    """Return what a row says about its run."""
-    return {
-        "run": run_key(run),
-        "encoder": run.encoder,
-        "view": "+".join(run.views),
-        "training_seed": run.seed,
-        "trained_by": run.algo or run.policy,
-        "recipe": run.recipe,
-        "demonstrations": run.demonstrations,
-        "hierarchical": run.termination,
-        "expert_swap": run.expert_swap,
-        "condition": run.condition,
-    }
-
-
-def _store_run(
-    experiment: Experiment, out: Path, problems: list[str], skipped: Sequence[RunState]
-) -> None:
-    """Write what the report says about the sweep; only when something changed."""
-    old = files.read_json(out / RUN_FILE) if (out / RUN_FILE).exists() else {}
-    made = {
-        "format": FORMAT,
-        "title": "sweep",
-        "command": old.get("command") or command_line(),
-        "data": experiment.text,
-        "problems": problems,
-        "skipped": [
-            {"key": state.key, "run": to_mapping(state.run), "reason": state.reason}
-            for state in skipped
-        ],
-        "provenance": old.get("provenance") or provenance(),
-    }
-    if made != old:
-        files.write_json(out / RUN_FILE, made)
