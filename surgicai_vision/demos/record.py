@@ -168,8 +168,9 @@ def record(
         InputError: fewer than one episode, a negative seed or post_success_steps, starts that
             are reserved for validation or tests, an unknown demonstrator, demonstrations for a
             demonstrator that does not learn from any, none for one that does, a source for one
-            that chooses no demonstration, upsets in a task that has none, or held actions
-            (`action_repeat`) in demonstrations that go on after their success.
+            that chooses no demonstration, upsets in a task that has none, held actions
+            (`action_repeat`) in demonstrations that go on after their success, or a whole
+            procedure that goes on only when told to.
         OutputExists: `out` holds something else.
         SurgicaiError: the demonstrator failed at too many seeds.
     """
@@ -183,6 +184,11 @@ def record(
     _check_demos(demonstrator, demos, source)
     check_late(demonstrator, disturbance)
     _check_held(config, demonstrator, post_success_steps)
+    if config.task == names.SUTURE and config.advance == "told" and learner is None:
+        raise InputError(
+            f"advance is 'told', but demonstrator '{demonstrator}' tells no env to begin the next "
+            "subtask, so that no episode could succeed; leave env.advance out."
+        )
     if disturbance.upset_fraction:
         check_upset_task(config.task)
     # What determines the result: a finished folder of the same request is left as it is. Unused

@@ -99,19 +99,13 @@ def make_task(
         **arguments: fields of `TaskConfig` and arguments of `make`.
     """
     fields: dict[str, Any] = {key: arguments.pop(key) for key in OPTIONS if key in arguments}
-    if "randomisation" in arguments:
-        axes = arguments.pop("randomisation")
-        fields["randomisation"] = (
-            from_mapping(RandomisationConfig, axes, "randomisation")
-            if isinstance(axes, dict)
-            else axes
-        )
-    chosen = (
-        from_mapping(SceneConfig, scene, "scene")
-        if isinstance(scene, dict)
-        else scene or SceneConfig()
-    )
-    return make(TaskConfig(task=task, scene=chosen, **fields), **arguments)
+    axes = arguments.pop("randomisation", None) or RandomisationConfig()
+    if not isinstance(axes, RandomisationConfig):
+        axes = from_mapping(RandomisationConfig, axes, "randomisation")
+    chosen = scene or SceneConfig()
+    if not isinstance(chosen, SceneConfig):
+        chosen = from_mapping(SceneConfig, chosen, "scene")
+    return make(TaskConfig(task=task, scene=chosen, randomisation=axes, **fields), **arguments)
 
 
 def make_registered(task: str, **arguments: Any) -> SuturingEnv:

@@ -45,7 +45,7 @@ from surgicai_vision.envs.feasibility import refuse_impossible
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.envs.relative import relative_features
-from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
+from surgicai_vision.envs.simulation import SUBSTEPS, Simulation, refuse_beyond_mujoco
 from surgicai_vision.envs.subtask import Subtask, Tolerance
 from surgicai_vision.envs.success import Info, Target, measure, meets_demands
 from surgicai_vision.scene import build_scene
@@ -126,6 +126,9 @@ class SuturingEnv(gymnasium.Env):
         self._subtasks = subtasks
         self.simulation.task_state.phase = subtasks[0].phase
         self._step_size = StepSize.of(config.step)
+        # A rendered step of a held action is longer, so a video of them has fewer frames a second.
+        fps = config.steps_per_second
+        self.metadata = {**self.metadata, "render_fps": fps}  # type: ignore[misc]
         self.calibration = Calibration(self.simulation)
         for camera in view.cameras if view.visual else ():
             self.calibration.window(camera, view.image_size)  # a crop that does not fit is refused
@@ -330,8 +333,18 @@ class SuturingEnv(gymnasium.Env):
 
     @property
     def subtask(self) -> Subtask:
-        """Return the present subtask."""
-        return self._subtasks[self.simulation.task_state.phase - self._subtasks[0].phase]
+        """Return the present subtask.
+
+        Raises:
+            InputError: the restored state is one of a subtask that this task does not have.
+        """
+        index = self.simulation.task_state.phase - self._subtasks[0].phase
+        if not 0 <= index < len(self._subtasks):
+            raise InputError(
+                f"The state is one of subtask {self.phase}, which '{self.config.task}' does not "
+                "have; restore it in an env of that subtask or of the whole procedure."
+            )
+        return self._subtasks[index]
 
     @property
     def phase(self) -> int:
@@ -379,12 +392,18 @@ class SuturingEnv(gymnasium.Env):
             self._meet_draws()
 
     def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
-        """Set positions and velocities, as gymnasium's MujocoEnv does; commands are kept."""
+        """Set positions and velocities, as gymnasium's MujocoEnv does; commands are kept.
+
+        Raises:
+            InputError: not of this scene's shapes, or numbers that MuJoCo would answer by silently
+                resetting itself.
+        """
         if np.shape(qpos) != (self.model.nq,) or np.shape(qvel) != (self.model.nv,):
             raise InputError(
                 f"set_state got shapes {np.shape(qpos)} and {np.shape(qvel)}; "
                 f"this scene needs ({self.model.nq},) and ({self.model.nv},)."
             )
+        refuse_beyond_mujoco(np.append(qpos, qvel))
         self._moves += 1
         self.data.qpos[:] = qpos
         self.data.qvel[:] = qvel

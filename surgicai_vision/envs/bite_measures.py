@@ -215,6 +215,7 @@ class SoftWatch:
         self._pair = pair
         self._marks = [hole for each in (pair, *others) for hole in (each.entry, each.exit)]
         self._is_own = False
+        self._began_wrong = False
         self._seen = self._latest()
 
     def update(self) -> None:
@@ -233,6 +234,7 @@ class SoftWatch:
                 exit_angle=math.nan,
                 depth=math.nan,
                 length=math.nan,
+                wrong_hole=self._began_wrong,
             )
         elif before is None or now.exit != before.exit:
             self._leave(now, now.exit)
@@ -244,10 +246,11 @@ class SoftWatch:
     def _enter(self, bite: Bite) -> None:
         """Begin a bite."""
         mark = self._nearest(bite.entry)
+        self._began_wrong = mark is not self._pair.entry
         self.measures = BiteMeasures(
             entry_error=math.dist(bite.entry, self._pair.entry.centre),
             entry_angle=angle_to(_inwards(mark), tip_tangent(self._simulation)),
-            wrong_hole=mark is not self._pair.entry,
+            wrong_hole=self._began_wrong,
         )
 
     def _leave(self, bite: Bite, leave: Point) -> None:
@@ -260,7 +263,7 @@ class SoftWatch:
             exit_angle=angle_to(mark.normal, tip_tangent(self._simulation)),
             depth=depth_under(bite.entry, leave, bite.path) if own else math.nan,
             length=math.dist(bite.entry, leave) if own else math.nan,
-            wrong_hole=self.measures.wrong_hole or mark is not self._pair.exit,
+            wrong_hole=self._began_wrong or mark is not self._pair.exit,
         )
 
     def _nearest(self, point: Point) -> Hole:

@@ -25,7 +25,6 @@ class Images:
 
     def __init__(self, simulation: Simulation, calibration: Calibration):
         self._simulation = simulation
-        self._skin: Skin | None = None
         self._calibration = calibration
         self._renderer: FrameRenderer | None = None
         self._stands: dict[str, str] = {}
@@ -72,8 +71,9 @@ class Images:
         ):
             self.close()
             tissue = self._simulation.tissue
-            if tissue is not None and self._skin is None:
-                self._skin = Skin(self._simulation, tissue)
-            renderer = FrameRenderer(self._simulation.model, *size, quality, self._skin)
+            if tissue is not None and tissue.drawn_skin is None:
+                tissue.drawn_skin = Skin(self._simulation, tissue)
+            skin = None if tissue is None else tissue.drawn_skin
+            renderer = FrameRenderer(self._simulation.model, *size, quality, skin)
             self._renderer = renderer
         return renderer

@@ -8,8 +8,9 @@ An `EpisodeMonitor` only reads: an episode is the same with and without it.
   grasped it.
 * `force`: net force on the tissue when the last control step ended [N]; 0 at the start.
 * `tissue_force`: largest net force [N] of needle and instruments (not of the thread) on the
-  phantom, as a force plate under it would show. It is sampled when a control step ends, at 50 Hz,
-  so a shorter impact can be missed. `tissue_impulse` is the net force summed over time [N s].
+  phantom, as a force plate under it would show. It is sampled when a control step ends, at 50 Hz
+  (when an action ends, where actions are held), so a shorter impact can be missed. `tissue_impulse`
+  is the net force summed over time [N s].
 * `tears`: how often the tissue tore; NaN in channels, which cannot tear.
 * `thread_drawn`: largest length of thread drawn out of the exit behind the needle [m]; 0 before the
   needle is out, NaN without a thread.
@@ -57,6 +58,7 @@ class EpisodeMonitor:
         self.force = 0.0
         self.tissue_force = 0.0
         self.tissue_impulse = 0.0
+        self._steps = 0
         self.tears = math.nan if self._env.simulation.tissue is None else 0.0
         self.thread_drawn = 0.0 if self._thread else math.nan
         self.paper_success = False
@@ -65,6 +67,7 @@ class EpisodeMonitor:
         """Begin an episode; the env has just been reset."""
         self.clear()
         simulation = self._env.simulation
+        self._steps = simulation.task_state.steps
         pair = self._env.stitch.pair
         pairs = [simulation.placement.placed_pair(other) for other in self._layout]
         others = [other for index, other in enumerate(pairs) if index != simulation.pair_index]
@@ -79,7 +82,10 @@ class EpisodeMonitor:
         self.turn = max(self.turn, float(turn))
         self.force = self._plate.force(simulation.data)
         self.tissue_force = max(self.tissue_force, self.force)
-        self.tissue_impulse += self.force * self._env.dt
+        # A step of a held action is several control steps.
+        steps = simulation.task_state.steps
+        self.tissue_impulse += self.force * self._env.dt * (steps - self._steps)
+        self._steps = steps
         self.paper_success = self.paper_success or bool(info["paper_success"])
         self._watch.update()
         if simulation.tissue is not None:

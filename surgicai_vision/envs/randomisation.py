@@ -153,6 +153,15 @@ def with_numbers(draws: Draws, given: Mapping[str, Sequence[float]]) -> Draws:
     return tuple(values)
 
 
+def checked(draws: Draws) -> Draws:
+    """Return one episode's numbers, `SIZE` of them, or refuse numbers that no episode can have.
+
+    Raises:
+        InputError: naming the axis and what is allowed.
+    """
+    return with_numbers(NOTHING, {axis: draws[place] for axis, place in _PLACES.items()})
+
+
 def _checked(axis: str, numbers: object) -> list[float]:
     """Return an axis's numbers, or refuse numbers that no episode can have."""
     try:

@@ -523,19 +523,19 @@ class Simulation:
             state: a state of this scene.
             given: axis → its numbers, as `randomisation.report` returns them.
         """
-        mujoco.mj_setState(self.model, self.data, state, STATE)
-        draws = tuple(self.data.userdata[_DRAWS:_WELDS].tolist())
-        self.data.userdata[_DRAWS:_WELDS] = randomisation.with_numbers(draws, given)
-        redrawn = np.empty_like(state)
-        mujoco.mj_getState(self.model, self.data, redrawn, STATE)
+        # MuJoCo stores the parts of a state in the order of their bits.
+        first = mujoco.mj_stateSize(self.model, STATE & (_USER_DATA - 1))
+        place = slice(first + _DRAWS, first + _WELDS)
+        redrawn = np.array(state, dtype=np.float64)
+        redrawn[place] = randomisation.with_numbers(tuple(redrawn[place].tolist()), given)
         return redrawn
 
     def set_state(self, state: NDArray[np.float64]) -> None:
         """Restore a vector of `get_state`.
 
         Raises:
-            InputError: of another length, not finite, or of a randomised episode although this env
-                has no randomisation.
+            InputError: of another length, with numbers that no state has, or of a randomised
+                episode although this env has no randomisation.
         """
         vector = np.ascontiguousarray(state, dtype=np.float64)
         size = mujoco.mj_stateSize(self.model, STATE)
@@ -543,14 +543,13 @@ class Simulation:
             raise InputError(
                 f"The state has shape {vector.shape}; this scene's states have shape ({size},)."
             )
-        if not np.isfinite(vector).all():
-            raise InputError("The state holds numbers that are not finite.")
+        refuse_beyond_mujoco(vector)
         userdata = np.empty(self.model.nuserdata)
         mujoco.mj_extractState(self.model, vector, STATE, userdata, _USER_DATA)
         values = userdata.tolist()
         draws = tuple(values[_DRAWS:_WELDS])
         if draws != self.draws:
-            self.randomise(draws)
+            self.randomise(randomisation.checked(draws))
         mujoco.mj_setState(self.model, self.data, vector, STATE)
         self.task_state = TaskState.unpack(values)
         for index, arm in enumerate(names.ARMS):
@@ -561,3 +560,15 @@ class Simulation:
         if self.tissue:
             self.tissue.unpack(values[USED:])
         self.refresh()
+
+
+def refuse_beyond_mujoco(values: NDArray[np.float64]) -> None:
+    """Refuse numbers that are not finite or so large that MuJoCo resets itself to its own start.
+
+    Raises:
+        InputError: there is one.
+    """
+    if not (np.abs(values) <= mujoco.mjMAXVAL).all():
+        raise InputError(
+            f"The state holds numbers that are not finite, or beyond ±{mujoco.mjMAXVAL:g}."
+        )

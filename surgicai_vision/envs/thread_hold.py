@@ -241,4 +241,9 @@ class ThreadHolds:
             ThreadHold.unpack(values[slot * size : (slot + 1) * size])
             for slot in range(len(self._holds))
         ]
+        # Sliders that hold nothing creep by the last bits; MuJoCo's state has them as they were.
+        data = self._data
+        places, speeds = data.qpos[self._slides].copy(), data.qvel[self._dofs].copy()
         self.write()
+        data.qpos[self._slides] = places
+        data.qvel[self._dofs] = speeds

@@ -37,6 +37,7 @@ continues bit for bit.
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -51,6 +52,9 @@ from surgicai_vision.scene import Scene
 from surgicai_vision.scene import tissue as elements
 from surgicai_vision.scene.compose import SURFACES, THREAD
 from surgicai_vision.scene.holes import PAIRS, SURFACE, HolePair, Point
+
+if TYPE_CHECKING:
+    from surgicai_vision.envs.skin import Skin
 
 OUTSIDE, INSIDE, THROUGH, TRAILING = range(4)
 """Stages of the needle's passage; see the module's docstring."""
@@ -88,6 +92,10 @@ class Tissue:
         scene: a scene with soft tissue.
         model: the simulation's own copy of its model; bits, friction and holds are written to it.
         data: the simulation's.
+
+    Attributes:
+        drawn_skin: what draws it, None before the first image (`camera_rig`). All renderers of the
+            simulation share it, since it writes to the model's only meshes.
     """
 
     def __init__(self, scene: Scene, model: mujoco.MjModel, data: mujoco.MjData):
@@ -102,6 +110,7 @@ class Tissue:
         self._free = scene.needle_qpos
         self._needle_geoms = scene.needle_geoms
         self._scratch: mujoco.MjData | None = None
+        self.drawn_skin: Skin | None = None
         self._look_up(len(PAIRS[config.layout]))
         self.meet(self._arc.radius, self._arc.tip_angle)
         self.clear()

@@ -148,8 +148,8 @@ class Upset:
     def before_step(self) -> bool:
         """Let the upset happen if it is due; return True if the needle was pushed.
 
-        Call this before every control step, and before the state is observed. A push that finds no
-        room is tried again at the next step.
+        Call this before every step of the env, and before the state is observed. A push that finds
+        no room is tried again at the next step.
         """
         plan = self._plan
         if plan is None or self.step >= 0:
@@ -157,8 +157,9 @@ class Upset:
         is_possible, is_late = _POSSIBLE[plan.kind](self._env)
         if not is_possible:
             return False
-        self._waited += 1
-        if self._waited <= plan.wait and not is_late:
+        waited = self._waited
+        self._waited += self._env.config.action_repeat
+        if waited < plan.wait and not is_late:
             return False
         is_push = plan.kind == "push"
         if is_push and not _push(self._env, plan.heading):
@@ -171,7 +172,7 @@ class Upset:
         """Return what is executed instead of `action`, (7,): opening jaws, or `action` itself."""
         if not self._opening:
             return action
-        self._opening -= 1
+        self._opening = max(0, self._opening - self._env.config.action_repeat)
         opened = np.zeros_like(action)
         opened[JAW] = 1.0
         return opened

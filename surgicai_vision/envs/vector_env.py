@@ -11,7 +11,7 @@ number of workers. `benchmarks/speed.py --only workers` measures the speed.
 
 import itertools
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
@@ -24,7 +24,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.errors import InputError, SurgicaiError, check_name
 from surgicai_vision.core.processes import Child
 from surgicai_vision.core.tasks import task_steps
 from surgicai_vision.envs import SuturingEnv, make_task, refuse_max_steps
@@ -55,6 +55,8 @@ def make_vector(
         **arguments: what `envs.make_task` takes, without `max_steps`.
     """
     refuse_max_steps(arguments)
+    if not isinstance(autoreset_mode, AutoresetMode):
+        check_name("autoreset mode", autoreset_mode, [mode.value for mode in AutoresetMode])
     # An env of another distribution ends its episodes itself, after so many control steps.
     own = task_steps(arguments["task"]) if arguments["task"] in names.TASKS else 0
     arguments["max_steps"] = (max_episode_steps or own) * arguments.get("action_repeat", 1)
@@ -126,12 +128,12 @@ class SuturingVectorEnv(VectorEnv):
             raise InputError(
                 f"seed holds {len(seeds)} seeds; this vector env has {self.num_envs} envs."
             )
-        mask = (options or {}).get("reset_mask")
+        mask = self._checked_mask(options)
         chosen = []
         for share in self._shares:
             part = dict(options) if options else None
             if part is not None and mask is not None:
-                part["reset_mask"] = np.asarray(mask)[share]
+                part["reset_mask"] = mask[share]
             chosen.append((seeds[share], part))
         infos = self._ask_all("reset", chosen)
         return deepcopy(self._seen), self._merge(infos)
@@ -184,6 +186,19 @@ class SuturingVectorEnv(VectorEnv):
         for worker in self._workers:
             worker.dismiss()
         self._workers = []
+
+    def _checked_mask(self, options: Mapping[str, object] | None) -> NDArray[np.bool_] | None:
+        """Return which envs a reset is for, (num_envs,), or None for all; refuse a wrong mask."""
+        if options is None or "reset_mask" not in options:
+            return None
+        mask = np.asarray(options["reset_mask"])
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise InputError(
+                f"options['reset_mask'] is {mask.dtype} of shape {mask.shape} with "
+                f"{np.count_nonzero(mask)} chosen; it must be bool of shape ({self.num_envs},) "
+                "with at least one."
+            )
+        return mask
 
     def _check_open(self) -> None:
         if self.closed or not self._workers:

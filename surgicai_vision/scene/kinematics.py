@@ -178,9 +178,13 @@ def start_in_base(arm: str) -> NDArray[np.float64]:
 
 
 def forward(q6: ArrayLike, instrument: str = DEFAULT) -> NDArray[np.float64]:
-    """Return T_base_tip (4, 4) of the joints (6,) [rad, m]; limits are not checked."""
+    """Return T_base_tip (4, 4) of the joints (6,) [rad, m]; limits are not checked.
+
+    Raises:
+        InputError: not six finite numbers.
+    """
     check_name("instrument", instrument, INSTRUMENTS)
-    pose = forward_flat(np.asarray(q6, dtype=np.float64).tolist(), instrument)
+    pose = forward_flat(_six("q6", q6), instrument)
     return _matrix(pose[:3], np.array(pose[3:]).reshape(3, 3))
 
 
@@ -196,15 +200,24 @@ def inverse(
 
     Raises:
         UnreachablePose: outside a joint limit; the message names joint, value and limit.
-        InputError: not a (4, 4) matrix of finite numbers.
+        InputError: not a (4, 4) matrix of finite numbers, or `near` not six of them.
     """
     check_name("instrument", instrument, INSTRUMENTS)
     matrix = np.asarray(T_base_tip, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"T_base_tip must be a finite 4 × 4 matrix; its shape is {matrix.shape}.")
     pose = (*matrix[:3, 3].tolist(), *matrix[:3, :3].ravel().tolist())
-    joints = None if near is None else tuple(np.asarray(near, dtype=np.float64).tolist())
+    joints = None if near is None else _six("near", near)
     return np.array(inverse_flat(pose, instrument, joints))
+
+
+def _six(name: str, values: ArrayLike) -> Joints:
+    """Return an argument as the joints of one arm, or refuse it."""
+    joints = np.asarray(values, dtype=np.float64)
+    if joints.shape != (len(DVRK_JOINTS),) or not np.isfinite(joints).all():
+        raise InputError(f"{name} must be six finite numbers; its shape is {joints.shape}.")
+    a, b, c, d, e, f = joints.tolist()
+    return a, b, c, d, e, f
 
 
 def forward_flat(q: Joints, instrument: str = DEFAULT) -> Pose:

@@ -317,6 +317,21 @@ def test_demonstrations_that_go_on_hold_no_actions(goes_on, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("demonstrator", ["expert", "search", "recover"])
+def test_a_procedure_that_waits_to_be_told_is_refused(demonstrator, tmp_path):
+    """Its env would stay in the grasp until every episode has reached its limit."""
+    told = TaskConfig(names.SUTURE, advance="told")
+    with pytest.raises(InputError, match="no episode could succeed"):
+        record(
+            told,
+            episodes=1,
+            out=tmp_path / "out",
+            demonstrator=demonstrator,
+            context=RunContext(0),
+        )
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(("held", "moves"), [(1, 8), (2, 4), (3, 3)])
 def test_a_perturbed_start_is_as_far_off_however_long_an_action_is_held(held, moves):
     taken = []

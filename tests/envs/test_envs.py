@@ -40,6 +40,14 @@ def test_render_gives_an_image():
     assert make("grasp").render() is None
 
 
+@pytest.mark.parametrize(("held", "fps"), [(1, 50), (2, 25), (3, 16)])
+def test_a_video_of_held_actions_runs_in_real_time(held, fps):
+    env = gymnasium.make(env_id("grasp"), action_repeat=held, render_mode="rgb_array")
+    assert env.metadata["render_fps"] == fps
+    assert envs.SuturingEnv.metadata["render_fps"] == names.FPS
+    env.close()
+
+
 def test_the_habits_of_mujoco_env_hold():
     env = make("grasp")
     env.reset(seed=0)
@@ -162,7 +170,29 @@ def test_wrong_states_are_refused():
             env.set_state_vector(wrong)
     with pytest.raises(InputError, match="finite"):
         env.set_state_vector(np.full_like(state, np.nan))
+    # MuJoCo would answer such a position by resetting itself.
+    qpos, qvel = env.data.qpos.copy(), env.data.qvel.copy()
+    for wrong in (np.nan, 1e11):
+        with pytest.raises(InputError, match=r"finite, or beyond ±1e\+10"):
+            env.set_state_vector(np.where(np.arange(len(state)) == 2, wrong, state))
+        for each in ((np.full_like(qpos, wrong), qvel), (qpos, np.full_like(qvel, wrong))):
+            with pytest.raises(InputError, match=r"finite, or beyond ±1e\+10"):
+                env.set_state(*each)
     assert np.array_equal(env.get_state(), state)
+
+
+@pytest.mark.parametrize("task", ["grasp", "place", "handoff", "pullout"])
+def test_a_state_of_another_subtask_is_not_taken_for_one_of_its_own(task):
+    procedure, env = make(names.SUTURE), make(task)
+    procedure.reset(seed=0)
+    procedure.enter(names.SUBTASKS.index("insert"))
+    env.reset(seed=0)
+    env.set_state_vector(procedure.get_state())
+    for use in (env.observe, env.measure, lambda: env.step(np.zeros(7))):
+        with pytest.raises(InputError, match=f"subtask 2, which '{task}' does not have"):
+            use()
+    env.reset(seed=0)
+    assert env.subtask.name == task
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
@@ -224,6 +254,9 @@ def test_actions_beyond_the_box_are_clipped():
         ({"tolerance": "papers"}, ("paper", "released")),
         ({"step": "big"}, ("paper", "released", "shipped")),
         ({"scene": {"layout": "complex"}}, names.LAYOUTS),
+        ({"scene": "simple"}, ("scene", "table of keys", "str")),
+        ({"randomisation": "world"}, ("randomisation", "table of keys", "str")),
+        ({"randomisation": {"lihgt": 0.1}}, ("'lihgt'", "'light'")),
         ({"scene": {"layouts": "simple"}}, ("layout", "thread", "hole_pair")),
         ({"image_size": 8}, ("16", "960")),
         ({"image_size": (224,)}, ("height, width",)),

@@ -1,6 +1,8 @@
 """The episode monitor: it measures known cases correctly and changes nothing."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.envs.bite_measures import angle_to, depth_under
+from surgicai_vision.envs.bite import Bite
+from surgicai_vision.envs.bite_measures import SoftWatch, angle_to, depth_under
 from surgicai_vision.envs.episode_monitor import EpisodeMonitor, drawn_length
 from surgicai_vision.envs.force_plate import ForcePlate
 from surgicai_vision.envs.hole_crossing import crossing
@@ -55,6 +58,17 @@ def test_an_instrument_that_is_driven_into_the_tissue_presses_it():
         monitor.update(env.step(action)[4])
     assert monitor.tissue_force > 1.0
     assert 0 < monitor.tissue_impulse < monitor.tissue_force * env.config.max_steps * env.dt
+
+
+def test_the_impulse_is_summed_over_all_control_steps_of_a_held_action():
+    env, monitor = started(action_repeat=4)
+    down = env.simulation.bases[names.PSM2]
+    action = np.array([*(-np.array(down[9:12])), 0, 0, 0, 0], np.float32)
+    impulse = 0.0
+    for _ in range(env.config.max_steps // 4):
+        monitor.update(env.step(action)[4])
+        impulse += monitor.force * 4 * env.dt
+    assert monitor.tissue_impulse == pytest.approx(impulse) and impulse > 1.0
 
 
 def test_monitoring_changes_nothing():
@@ -299,6 +313,24 @@ def test_a_bite_of_the_start_is_not_the_episodes():
     assert env.simulation.tissue.bites
     drive(env, monitor)
     assert math.isnan(monitor.bite.entry_error) and math.isnan(monitor.bite.exit_error)
+
+
+def test_a_bite_drawn_back_from_the_wrong_mark_may_end_at_the_right_one():
+    env, _ = soft()
+    pair, other = PAIRS["simple"][:2]
+    tissue = SimpleNamespace(bites=())
+    watch = SoftWatch(env.simulation, tissue, pair, [other])
+    inside = Bite(pair.entry.centre, None, "entry", "", 1, 0, 1e-3, 4e-3, 0, False)
+    wrong, right = (
+        replace(inside, exit=one.exit.centre, exit_side="exit", exit_piece=piece)
+        for one, piece in ((other, 2), (pair, 1))
+    )
+    seen = []
+    for bite in (inside, wrong, inside, right):
+        tissue.bites = (bite,)
+        watch.update()
+        seen.append(watch.measures.wrong_hole)
+    assert seen == [False, True, False, False]
 
 
 @pytest.mark.parametrize(("shift", "success"), [(0.0019, True), (0.0021, False)])

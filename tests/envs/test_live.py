@@ -267,6 +267,18 @@ def test_human_shows_what_is_stepped_and_changes_nothing(monkeypatch, capsys):
     assert f"Open {live.server.url}" in capsys.readouterr().err
 
 
+def test_human_shows_an_env_that_was_restored_instead_of_reset(monkeypatch):
+    monkeypatch.setattr(human, "has_display", lambda: False)
+    plain = envs.make(TaskConfig("handoff"))
+    plain.reset(seed=3)
+    shown = envs.make(TaskConfig("handoff"), render_mode="human")
+    shown.set_state_vector(plain.get_state())
+    for _ in range(3):
+        shown.step(np.zeros(7, np.float32))
+    assert len(shown._human._page._live.curves(0)["points"]) == 3
+    shown.close()
+
+
 HUMAN = """
 import gymnasium, surgicai_vision
 env = gymnasium.make("surgicai_vision/Handoff-v0", render_mode="human")

@@ -168,6 +168,37 @@ def test_a_randomised_state_is_refused_by_an_env_without():
     np.testing.assert_array_equal(plain.get_state(), before)
 
 
+@pytest.mark.parametrize(
+    ("axis", "numbers"),
+    [("appearance", [99.0, 1.0]), ("pair", [7.0]), ("needle_size", [-1.0]), ("friction", [-2.0])],
+)
+def test_a_state_with_numbers_that_no_episode_has_is_refused(axis, numbers):
+    env = made(friction=0.2)
+    env.reset(seed=1)
+    state = env.get_state()
+    drawn = randomisation._PLACES["friction"].start
+    first = state.tolist().index(env.simulation.draws[drawn]) - drawn
+    spoilt = state.copy()
+    spoilt[first : first + randomisation.SIZE][randomisation._PLACES[axis]] = numbers
+    with pytest.raises(InputError, match=f"randomisation: {axis} has"):
+        env.set_state_vector(spoilt)
+    env.set_state_vector(state)
+    np.testing.assert_array_equal(env.get_state(), state)
+
+
+def test_replacing_numbers_of_a_state_leaves_the_env_where_it_is():
+    env = made(light=0.3)
+    env.reset(seed=1)
+    start = env.get_state()
+    env.step(np.ones(7, np.float32))
+    before = env.get_state()
+    redrawn = env.simulation.redrawn(start, {"light": [0.1, 0.0, -0.1]})
+    np.testing.assert_array_equal(env.get_state(), before)
+    assert (redrawn != start).sum() == 3
+    env.set_state_vector(redrawn)
+    assert env.simulation.draws[randomisation._PLACES["light"]] == (0.1, 0.0, -0.1)
+
+
 def test_a_snapshot_continues_with_the_same_episodes():
     """In the same env, and in one that has drawn others; the snapshot may be stored as JSON."""
     env = made(phantom_shift=3.0)

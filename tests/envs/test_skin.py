@@ -10,6 +10,7 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig
 from surgicai_vision.demos.expert import Expert
+from surgicai_vision.envs.camera_rig import Images
 from surgicai_vision.envs.skin import PLACE, WAY, Skin
 from surgicai_vision.envs.tissue import INSIDE, OUTSIDE, THROUGH
 from surgicai_vision.scene.holes import PAIRS, SURFACE
@@ -143,24 +144,37 @@ def test_restored_states_look_the_same(insertion):
     other.close()
 
 
+def test_two_renderers_of_one_size_show_the_same_skin(insertion):
+    """They share the GPU's meshes: each counted versions for itself, and could miss a change."""
+    env, states = insertion
+    whole, before, after = states[0][1], last(states, OUTSIDE), last(states, INSIDE)
+    one, other = (Images(env.simulation, env.calibration) for _ in range(2))
+    for rig, state in ((one, whole), (other, whole), (one, before), (other, after)):
+        env.set_state_vector(state)
+        seen = rig.frames("endo_left", (SIZE, SIZE), (names.RGB,))[names.RGB]
+    for each in (env, one, other):
+        each.close()
+    np.testing.assert_array_equal(seen, env.observe()["endo_left"])
+
+
 def test_a_dent_has_depth(insertion):
     env, states = insertion
     env.set_state_vector(states[0][1])
     key = names.frame_key("endo_left", names.DEPTH)
     whole = env.observe()[key]
-    model_skin = env._images._skin._drawn
+    model_skin = env.simulation.tissue.drawn_skin._drawn
     state = SkinState(0, (Pull((0.0, 0.05, SURFACE), (0.0, 0.0, -3e-3), 4e-3),))
-    follow = env._images._skin.follow
+    follow = env.simulation.tissue.drawn_skin.follow
 
     def dented():
         model_skin.shape(state)
         return model_skin.versions
 
-    env._images._skin.follow = dented
+    env.simulation.tissue.drawn_skin.follow = dented
     try:
         deeper = env.observe()[key] - whole
     finally:
-        env._images._skin.follow = follow
+        env.simulation.tissue.drawn_skin.follow = follow
     assert deeper.max() > 1e-3
     env.close()
 

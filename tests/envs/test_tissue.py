@@ -371,6 +371,20 @@ def test_a_state_in_the_middle_of_a_stitch_goes_on_bit_for_bit_anywhere(thread):
     assert any(drawn for _, drawn in seen) == bool(thread)
 
 
+def test_a_slider_that_holds_nothing_is_restored_where_it_was():
+    """Some creep by the last bits while the needle moves."""
+    config = TaskConfig("pullout", dataclasses.replace(SOFT, thread=10))
+    env, other = envs.make(config), envs.make(config)
+    env.reset(seed=names.VALIDATION_SEED)
+    other.reset(seed=names.VALIDATION_SEED + 1)
+    slider = env.model.joint("thread_slider_0")
+    env.data.qpos[slider.qposadr[0]] = 9e-22
+    env.data.qvel[slider.dofadr[0]] = 5e-20
+    state = env.get_state()
+    other.set_state_vector(state)
+    np.testing.assert_array_equal(other.get_state(), state)
+
+
 def test_reading_forces_changes_nothing():
     plain, read = (envs.make(TaskConfig("insert", SOFT)) for _ in range(2))
     for env in (plain, read):

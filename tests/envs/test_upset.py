@@ -83,6 +83,22 @@ def test_jaws_open_while_they_hold_and_the_needle_drops():
     assert upset.step == 10 and not env.simulation.holds(names.PSM2)
 
 
+@pytest.mark.parametrize(("held", "opened"), [(1, 6), (2, 6), (5, 10)])
+def test_an_upset_counts_control_steps_however_long_an_action_is_held(held, opened):
+    env = envs.make(TaskConfig("place", action_repeat=held))
+    env.reset(seed=3)
+    expert = Expert(env)
+    upset = Upset(env, UpsetPlan("drop", 10, 0.0))
+    steps = 0
+    for _ in range(30 // held):
+        upset.before_step()
+        action = expert.action()
+        executed = upset.altered(action)
+        steps += held if executed is not action else 0
+        env.step(executed)
+    assert (upset.step, steps) == (10, opened)
+
+
 def test_nothing_happens_without_a_plan():
     env = envs.make(TaskConfig("grasp"))
     env.reset(seed=3)

@@ -172,8 +172,29 @@ def test_a_workers_error_and_its_death_are_told():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"workers": -1}, {"num_envs": 0}, {"workers": 2, "obs_type": "image"}]
+    "wrong",
+    [
+        {"workers": -1},
+        {"num_envs": 0},
+        {"workers": 2, "obs_type": "image"},
+        {"autoreset_mode": "same_step"},
+    ],
 )
 def test_wrong_arguments_are_refused(wrong):
     with pytest.raises(InputError):
         make_vector(**{"task": "place", "num_envs": 2, "workers": 1} | wrong)
+
+
+def test_a_wrong_mask_is_refused_and_the_workers_go_on():
+    vector = make_vec("place", "workers", 3)
+    try:
+        first = vector.reset(seed=0)[0]
+        wrongs = ([True, False], [True] * 4, [False] * 3, [1, 0, 0])
+        for wrong in wrongs:
+            with pytest.raises(InputError, match=r"bool of shape \(3,\) with at least one"):
+                vector.reset(options={"reset_mask": np.array(wrong)})
+        mask = np.array([False, True, False])
+        again = vector.reset(seed=7, options={"reset_mask": mask})[0]
+        np.testing.assert_array_equal((first != again).any(axis=1), mask)
+    finally:
+        vector.close()

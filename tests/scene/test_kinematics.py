@@ -153,3 +153,9 @@ def test_wrong_arguments_are_refused():
         inverse(np.eye(3))
     with pytest.raises(InputError, match="finite"):
         inverse(np.full((4, 4), np.nan))
+    start = kinematics.start_in_base("psm1")
+    for wrong in (np.zeros(5), np.full(6, np.nan), np.zeros((1, 6))):
+        with pytest.raises(InputError, match="q6 must be six finite numbers"):
+            forward(wrong)
+        with pytest.raises(InputError, match="near must be six finite numbers"):
+            inverse(start, near=wrong)

@@ -85,7 +85,12 @@ class _PageOfEnv:
         self._live.begin(self._episode)
 
     def step(self, info: Info, pacer: Pacer) -> None:
-        """Record the measures of a step, and draw if a page is waiting for an image."""
+        """Record the measures of a step, and draw if a page is waiting for an image.
+
+        An env that was not reset since it was opened, because its state was restored, begins here.
+        """
+        if not self._episode:
+            self.begin(info)
         self._steps += 1
         if self._steps:
             self._monitor.update(info)
