@@ -53,7 +53,7 @@ COMMANDS = MappingProxyType(
         "teleoperate": "Record demonstrations with the keyboard or a gamepad.",
         "import-demos": "Import SurgicAI's recordings, ROS bags, LeRobot datasets or drive logs.",
         "cut-demos": "Cut a subtask's visits out of recordings of whole procedures.",
-        "export-demos": "Turn demonstrations into transitions for SB3, d3rlpy and Minari.",
+        "export-demos": "Turn demonstrations into transitions for SB3, d3rlpy, Minari, robomimic.",
         "render-demos": "Render demonstrations into a LeRobot dataset.",
         "dataset": "Check, convert or share a dataset.",
         "encode": "Compute a dataset's frozen features.",

@@ -55,7 +55,7 @@ class Options:
     Attributes:
         file: A pickle as SurgicAI writes it, an npz of its arrays, a ROS bag, a folder of bags,
             the folder of a LeRobot dataset, or the log of `robot drive`.
-        task: The subtask that the file shows; required for a pickle, which does not say.
+        task: The subtask that the file shows; required for a pickle or an npz, which do not say.
         out: Folder to create.
         topic: Topics of a bag that differ from those of --convention.
         convention: Whose topic names a bag uses.
@@ -63,9 +63,13 @@ class Options:
     """
 
     file: Annotated[Path, Parameter(metavar="FILE")] = field(kw_only=False)
-    task: Annotated[str | None, SUBTASK, default_text("for a bag, every subtask found")] = None
+    task: Annotated[
+        str | None, SUBTASK, default_text("for a bag, a dataset or a log, every subtask found")
+    ] = None
     out: Annotated[
-        Path | None, DIRECTORY, default_text("outputs/demos/surgicai-<task> or outputs/demos/bag")
+        Path | None,
+        DIRECTORY,
+        default_text("surgicai-<task>, bag, dataset-<name> or drive in outputs/demos"),
     ] = None
     topic: Annotated[
         tuple[str, ...], Parameter(metavar="ROLE=/TOPIC[,ROLE=/TOPIC]", show_default=False)

@@ -135,7 +135,7 @@ PolicyName = Annotated[
     str,
     Parameter(
         help="The policy: a checkpoint folder, a hierarchical.yaml, released:NAME (see "
-        "`policies`), module:factory, or one of expert, replay, random and zero.",
+        "`policies`), module:factory, or one of expert, recover, replay, random and zero.",
         metavar="POLICY",
     ),
 ]

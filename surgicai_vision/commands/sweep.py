@@ -63,7 +63,14 @@ class Options:
     """
 
     grid: Annotated[str, Parameter(metavar="GRID.yaml")] = field(kw_only=False)
-    out: Annotated[Path | None, DIRECTORY, default_text("outputs/sweeps/<name of the file>")] = None
+    out: Annotated[
+        Path | None,
+        DIRECTORY,
+        default_text(
+            "outputs/sweeps/<name of the file>, with -tried after it where --demonstrations, "
+            "--epochs, --episodes or --size changes the file's"
+        ),
+    ] = None
     only: Annotated[
         tuple[str, ...], Parameter(metavar="AXIS=VALUE[,VALUE]"), default_text("all")
     ] = ()

@@ -64,6 +64,9 @@ NO_ENCODER = "none"
 """`--encoder`: proprioception alone."""
 STATE = "state"
 """`--encoder`: the state with the goal, an upper bound."""
+LEARNED = {*(algorithm.policy for algorithm in ALGORITHMS.values()), "residual"}
+"""Policies that `--algo` trains, and imitation does not."""
+IMITATED = tuple(name for name in policies.policy_names() if name not in LEARNED)
 
 
 def _check_encoder(_: type, name: str) -> None:
@@ -135,7 +138,7 @@ class Options:
     weights: WeightFiles = ()
     accept_licence: AcceptLicence = False
     pool: Annotated[str, POOL] = "global"
-    policy: Annotated[str, Parameter(choices=policies.policy_names())] = "bc"
+    policy: Annotated[str, Parameter(choices=IMITATED)] = "bc"
     recipe: Annotated[
         str | None,
         Parameter(

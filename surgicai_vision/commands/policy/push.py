@@ -10,6 +10,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import DIRECTORY
 from surgicai_vision.core.banks import HELD_OUT, bank_of
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.evaluation.hierarchical_config import SUFFIXES
 
 if TYPE_CHECKING:
     from surgicai_vision.training.checkpoint import Checkpoint
@@ -30,7 +31,7 @@ class Options:
     """Options of `policy push`.
 
     Attributes:
-        policy: A checkpoint folder, or released:NAME.
+        policy: A checkpoint folder, or released:NAME; of a whole procedure, push the parts.
         repo: Repository to push to; created if it does not exist.
         evaluation: Folder of an evaluation of this policy; the card states its successes.
         private: If the repository is created, make it private.
@@ -54,6 +55,11 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     from surgicai_vision.training.released import resolve
 
     folder = resolve(options.policy)
+    if folder.suffix in SUFFIXES:
+        raise InputError(
+            f"{options.policy} is a hierarchical policy, which has no weights of its own; push the "
+            "policies that its file names, one by one."
+        )
     checkpoint = read_checkpoint(folder)
     successes = _successes(options.evaluation, checkpoint) if options.evaluation else None
     if options.dry_run:

@@ -42,7 +42,7 @@ class Options:
     """Options of `policy tune`.
 
     Attributes:
-        policy: The YAML file of a hierarchical policy with learned ends.
+        policy: A hierarchical policy with learned ends: its YAML file, or released:suture.
         confidence: Values to try: probability that another subtask needs to end the present one.
         patience: Values to try: times in a row that the other subtask must be named.
         episodes: Number of validation starts, the same for every pair of values.
