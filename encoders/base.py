@@ -118,7 +118,8 @@ def best_device() -> torch.device:
 def best_dtype(device: torch.device) -> torch.dtype:
     """Return bfloat16 where the device multiplies it natively, else float32."""
     if device.type == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
+        native = torch.cuda.is_bf16_supported(including_emulation=False)
+        return torch.bfloat16 if native else torch.float32
     probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     native = any(getattr(torch.cpu, probe, lambda: False)() for probe in probes)
     return torch.bfloat16 if native else torch.float32
@@ -306,6 +307,13 @@ class Encoder:
                 f"Encoder '{self.card.name}' offers its global feature only; use pool 'global'."
             )
         features: torch.Tensor = take(images)
+        if not isinstance(features, torch.Tensor):  # several maps, of several sizes
+            raise InputError(
+                f"Encoder '{self.card.name}' has several feature maps side by side; use pool "
+                "'global'."
+            )
+        if features.ndim == 4 and getattr(self._network, "output_fmt", "NCHW") == "NHWC":
+            features = features.permute(0, 3, 1, 2)  # timm's Swin and its like
         if self.pool == "spatial":
             if features.ndim != 4:
                 raise InputError(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from encoders.card import EncoderCard
 from encoders.state import map_network, read_torch
 from surgicai_vision.core.errors import BadFile, MissingWeights
+from surgicai_vision.core.files import sha256_file
 
 if TYPE_CHECKING:
     import torch
@@ -86,7 +87,8 @@ def network_from(tensors: "dict[str, torch.Tensor]", where: object) -> "nn.Modul
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
     """Build the network from the packaged file or from `path`."""
     path = path or packaged_file()
-    return card, network_from(read_torch(path), path)
+    network = network_from(read_torch(path), path)
+    return replace(card, sha256=sha256_file(path)), network
 
 
 def first_stages(network: "nn.Module") -> "list[nn.Module]":

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from encoders.card import EncoderCard, Plugin
 from encoders.state import load_exactly, read_tensors
 from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.files import sha256_file
 
 if TYPE_CHECKING:
     from torch import nn
@@ -49,7 +50,7 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     }
     network = timm.create_model(card.architecture.removeprefix("timm "), num_classes=0)
     load_exactly(network, {k: v for k, v in tensors.items() if not k.startswith("fc.")}, path)
-    return card, network
+    return replace(card, sha256=sha256_file(path)), network
 
 
 def _smaller(depth: int) -> EncoderCard:

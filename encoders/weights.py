@@ -103,22 +103,25 @@ def _in_folder(card: EncoderCard, wanted: Mapping[str, str | None]) -> Path | No
     if not folder:
         return None
     for filename, sha256 in wanted.items():
-        for place in (Path(card.name) / filename, Path(card.name + Path(filename).suffix)):
-            path = Path(folder) / place
-            if path.is_file():
-                return check_hash(path, sha256)
+        path = Path(folder) / card.name / filename
+        if path.is_file():
+            return check_hash(path, sha256)
+        path = Path(folder) / f"{card.name}{Path(filename).suffix}"
+        if path.is_file():  # its name does not say which of the known files it is
+            return check_hash(path, *wanted.values())
         path = Path(folder) / filename
         if sha256 and path.is_file() and sha256_file(path).startswith(sha256):
             return path
     return None
 
 
-def check_hash(path: Path, sha256: str | None) -> Path:
-    """Return `path` if its hash is `sha256` begins so (or None is known), else refuse it."""
-    if sha256 is not None and not (actual := sha256_file(path)).startswith(sha256):
+def check_hash(path: Path, *allowed: str | None) -> Path:
+    """Return `path` if its hash begins as one that is allowed (None allows any), else refuse it."""
+    known = tuple(sha256 for sha256 in allowed if sha256 is not None)
+    if len(known) == len(allowed) and not (actual := sha256_file(path)).startswith(known):
         raise BadFile(
-            f"{path} is damaged or is a different file: sha256 {actual}, expected {sha256}; "
-            "replace it."
+            f"{path} is damaged or is a different file: sha256 {actual}, expected "
+            f"{' or '.join(dict.fromkeys(known))}; replace it."
         )
     return path
 

@@ -366,6 +366,20 @@ class Policy(nn.Module, abc.ABC):
         super().train(mode)
         return self
 
+    def load_state_dict(
+        self, state_dict: Mapping[str, torch.Tensor], strict: bool = True, assign: bool = False
+    ) -> tuple[list[str], list[str]]:
+        """Load a state; `act` then makes a new copy.
+
+        Returns:
+            Missing and unexpected names, as torch returns them.
+        """
+        object.__setattr__(self, "_exact", None)
+        names_left: tuple[list[str], list[str]] = super().load_state_dict(
+            state_dict, strict, assign
+        )
+        return names_left
+
     def observed(
         self, features: NDArray[np.float32] | None, agent_pos: NDArray[np.float32]
     ) -> NDArray[np.float64]:

@@ -49,8 +49,9 @@ class HLPRecipe(Recipe):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_at_least(0, progress=self.progress)
-        if self.privileged:
-            raise InputError("Policy 'hlp' sees both arms and images; leave 'privileged' off.")
+        for name in ("privileged", "setpoint", "progress_input"):
+            if getattr(self, name):
+                raise InputError(f"Policy 'hlp' sees both arms and images; leave '{name}' off.")
 
 
 @final

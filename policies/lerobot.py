@@ -8,19 +8,30 @@ import takes ten seconds, and commands that only name a policy start without it.
 the names, what a recipe must have, and which actions each policy learns from.
 """
 
+import contextlib
 import functools
 import importlib
+import io
+from collections.abc import Mapping
 
 from policies.base import Plugin, Policy, Recipe
 from policies.chunks import ChunkRecipe
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, first_line
+from surgicai_vision.core.config import JSON
+from surgicai_vision.core.errors import InputError, check_positive, first_line
 
 ADAPTER = "lerobot_env_surgicai.chunk_policies"
 DOWN_DIMS = (512, 1024, 2048)
 """LeRobot's `DiffusionConfig.down_dims`, for a recipe that sets none."""
+NOISE_LEVELS = 100
+"""LeRobot's `DiffusionConfig.num_train_timesteps`, for a recipe that sets none."""
 PREDICTED_TOKENS = 3
 """LeRobot's `VQBeTConfig.n_action_pred_token`, for a recipe that sets none."""
+UNFIT = (
+    *(AssertionError, ArithmeticError, LookupError),
+    *(RuntimeError, TypeError, ValueError),
+)
+"""What LeRobot and torch raise for settings with which a network cannot be built."""
 
 
 def horizon(recipe: ChunkRecipe) -> int:
@@ -32,8 +43,24 @@ def horizon(recipe: ChunkRecipe) -> int:
     return -(-(recipe.chunk + recipe.history - 1) // halvings) * halvings
 
 
+def _check_sampling(settings: Mapping[str, JSON]) -> None:
+    """Refuse settings with which a policy can be trained but cannot plan."""
+    levels = settings.get("num_train_timesteps", NOISE_LEVELS)
+    steps = settings.get("num_inference_steps")
+    if isinstance(levels, int) and isinstance(steps, int) and not 1 <= steps <= levels:
+        raise InputError(
+            f"settings: num_inference_steps is {steps}; allowed: 1 to num_train_timesteps, "
+            f"{levels}."
+        )
+    temperature = settings.get("bet_softmax_temperature")
+    if isinstance(temperature, int | float):
+        check_positive(**{"settings: bet_softmax_temperature": temperature})
+
+
 def _make(kind: str, recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> Policy:
     """Return an untrained policy of the adapter's class `kind`."""
+    assert isinstance(recipe, ChunkRecipe)
+    _check_sampling(recipe.settings)
     try:
         adapter = importlib.import_module(ADAPTER)
     except ImportError as error:
@@ -42,8 +69,10 @@ def _make(kind: str, recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> Pol
             "it alongside surgicai-vision."
         ) from None
     try:
-        policy: Policy = vars(adapter)[kind](recipe, visual)
-    except (AssertionError, ArithmeticError, RuntimeError, TypeError, ValueError) as error:
+        # VQ-BeT prints its size to stdout, where --json prints.
+        with contextlib.redirect_stdout(io.StringIO()):
+            policy: Policy = vars(adapter)[kind](recipe, visual)
+    except UNFIT as error:
         # LeRobot and torch check the settings of a network as they build it.
         raise InputError(
             f"LeRobot's {kind} cannot be made with these settings ({first_line(error)})."

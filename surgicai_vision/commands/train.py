@@ -34,7 +34,7 @@ from surgicai_vision.core.errors import InputError, check_at_most
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.features import encoders
 from surgicai_vision.features.devices import find_device
-from surgicai_vision.rl.algorithms import ALGORITHMS
+from surgicai_vision.rl.algorithms import ALGORITHMS, LEARNED
 from surgicai_vision.rl.high_level_config import DECISIONS, SAVE_EVERY, HighLevelRequest
 from surgicai_vision.rl.residual_config import ALGO, BOUND, ResidualRequest, residual_settings
 from surgicai_vision.training import policies
@@ -64,9 +64,8 @@ NO_ENCODER = "none"
 """`--encoder`: proprioception alone."""
 STATE = "state"
 """`--encoder`: the state with the goal, an upper bound."""
-LEARNED = {*(algorithm.policy for algorithm in ALGORITHMS.values()), "residual"}
-"""Policies that `--algo` trains, and imitation does not."""
 IMITATED = tuple(name for name in policies.policy_names() if name not in LEARNED)
+"""Choices of `--policy`: the others are what `--algo` trains."""
 
 
 def _check_encoder(_: type, name: str) -> None:

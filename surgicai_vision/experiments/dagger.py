@@ -62,7 +62,7 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
     spec = open_policy(folder, task=config.task)
     checkpoint = spec.about.get("checkpoint")
     if not isinstance(checkpoint, Mapping):
-        raise InputError(f"--learner {folder} is not trained; give a checkpoint folder.")
+        raise InputError(f"--learner {folder} is not one trained policy; give a checkpoint folder.")
     return Learner(folder, str(checkpoint["policy_sha256"]))
 
 

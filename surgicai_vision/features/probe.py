@@ -282,7 +282,7 @@ class _Ridge:
         centred = gram - row[None] - row[:, None] + row.mean()
         values, self._vectors = np.linalg.eigh(centred)
         self._values = np.maximum(values, 0.0)
-        self._scale = max(self._values.sum(), np.finfo(float).tiny)
+        self._scale = self._values.sum() or 1.0  # 0 where every feature is constant
         self._projected = (
             cross - cross.mean(1, keepdims=True) - row[None] + row.mean()
         ) @ self._vectors

@@ -185,3 +185,6 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType(
     }
 )
 """Name → algorithm, in the order of SurgicAI's tables."""
+
+LEARNED = frozenset({*(algorithm.policy for algorithm in ALGORITHMS.values()), "residual"})
+"""Registered policies that an algorithm trains, and imitation does not."""

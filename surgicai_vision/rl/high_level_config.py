@@ -3,8 +3,15 @@
 from dataclasses import dataclass, field
 from typing import final
 
-from surgicai_vision.core.errors import InputError, check_positive
+from surgicai_vision.core.errors import (
+    InputError,
+    check_at_least,
+    check_at_most,
+    check_finite,
+    check_positive,
+)
 from surgicai_vision.evaluation.hierarchical_config import ORDER, HierarchicalConfig
+from surgicai_vision.rl.settings import LEAST_BATCH, WIDEST
 
 DECISIONS = 1500
 """Decisions to learn from, by default."""
@@ -36,12 +43,9 @@ class HighLevelSettings:
     entropy: float = 0.01
 
     def __post_init__(self) -> None:
-        check_positive(
-            learning_rate=self.learning_rate,
-            rollout=self.rollout,
-            batch_size=self.batch_size,
-            epochs=self.epochs,
-        )
+        check_positive(learning_rate=self.learning_rate, epochs=self.epochs)
+        check_finite(learning_rate=self.learning_rate, entropy=self.entropy)
+        check_at_least(LEAST_BATCH, rollout=self.rollout, batch_size=self.batch_size)
         if not 0 < self.gamma < 1 or self.entropy < 0:
             raise InputError(
                 f"gamma is {self.gamma}, entropy {self.entropy}; allowed: between 0 and 1, and at "
@@ -49,6 +53,7 @@ class HighLevelSettings:
             )
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1.")
+        check_at_most(WIDEST, **{"the widest layer of hidden": max(self.hidden)})
 
 
 @final

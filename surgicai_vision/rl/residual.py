@@ -241,9 +241,15 @@ class _Training:
         self.policy = Residual(self.recipe, self.base.visual)
         self.policy.take_base(base)
         self.policy.eval().requires_grad_(False)
+        self.repeat = spec.config.action_repeat
         self.env = CorrectionEnv(agent, self.policy, spec.config)
         self.policy.standardise(self._played())
         self.model = self._model()
+
+    @property
+    def env_steps(self) -> int:
+        """Control steps taken: an action is held for `repeat` of them."""
+        return self.model.num_timesteps * self.repeat
 
     def _played(self) -> Vector:
         """Return the correction's input in episodes of the frozen policy alone, (n, sight)."""
@@ -305,7 +311,13 @@ class _Training:
     def run(self, out: Path, progress: Progress) -> Checkpoint:
         """Learn to the end, with periodic evaluations and training states."""
         request = self.request
-        stages = Stages(request.env_steps, request.save_every, request.seed, out, progress)
+        repeat = self.repeat
+
+        def show(done: int, total: int, unit: str = "", /) -> None:
+            progress(min(done * repeat, request.env_steps), request.env_steps)
+
+        steps = -(-request.env_steps // repeat)
+        stages = Stages(steps, -(-request.save_every // repeat), request.seed, out, show)
         save = functools.partial(self._save, out)
         best, kept = stages.run(self.model, self._resume(out), self._evaluate, save)
         return self._write(best, kept, out)
@@ -325,7 +337,7 @@ class _Training:
             )
             rows = [episode.row for episode in episodes]
         point = Point(
-            env_steps=self.model.num_timesteps,
+            env_steps=self.env_steps,
             updates=int(self.model._n_updates),
             minutes=minutes,
             successes=sum(row.success for row in rows),
@@ -375,7 +387,7 @@ class _Training:
             )
         checkpoint = dataclasses.replace(
             self.base,
-            run=run_of(self.request, self.base.run, self.model.num_timesteps),
+            run=run_of(self.request, self.base.run, self.env_steps),
             recipe=to_mapping(self.recipe),
             epoch=0,
             frames=kept.env_steps,

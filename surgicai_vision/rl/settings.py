@@ -10,6 +10,7 @@ from surgicai_vision.core.errors import (
     InputError,
     UnknownName,
     check_at_least,
+    check_at_most,
     check_finite,
     check_name,
     check_positive,
@@ -21,6 +22,10 @@ OBSERVATIONS = ("relative", "state")
 DEMANDS = ("auto", "achieved", "kept")
 LARGEST_SEED = 2**32 - 1
 """Largest seed of Stable-Baselines3 and d3rlpy, as of NumPy's legacy generator."""
+LEAST_BATCH = 2
+"""Smallest batch or rollout: PPO standardises over one, and a policy's recipe records no less."""
+WIDEST = 65_536
+"""Maximum units of a hidden layer: that of a policy's recipe (`policies.base` imports torch)."""
 STOP_AFTER = 2
 """Evaluations in a row that must reach `Settings.stop_at`."""
 
@@ -110,7 +115,6 @@ class Settings:
         check_name("relabel_demand", self.relabel_demand, DEMANDS)
         check_positive(
             learning_rate=self.learning_rate,
-            batch_size=self.batch_size,
             envs=self.envs,
             train_every=self.train_every,
             updates=self.updates,
@@ -133,6 +137,7 @@ class Settings:
             exploration_noise=self.exploration_noise,
             target_noise=self.target_noise,
         )
+        check_at_least(LEAST_BATCH, batch_size=self.batch_size)
         for name in ("gamma", "tau", "demo_share", "bc_weight"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(
@@ -140,6 +145,7 @@ class Settings:
                 )
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1.")
+        check_at_most(WIDEST, **{"the widest layer of hidden": max(self.hidden)})
         if not 0 <= self.stop_at <= 1:
             raise InputError(f"stop_at is {self.stop_at}; it must be a share from 0 to 1.")
         _ = self.success_rule  # refuses what is not allowed
@@ -225,6 +231,8 @@ class Request:
                 f"learning_starts is {settings.learning_starts}; hindsight needs whole episodes "
                 f"before the first update. Give at least {self.episode}, or 0."
             )
+        if "rollout" in algorithm.settings:
+            check_at_least(LEAST_BATCH, rollout=settings.rollout)
         rows = demonstration_rows(settings.demo_share, settings.batch_size)
         if "demo_share" in algorithm.settings and not 0 < rows < settings.batch_size:
             raise InputError(

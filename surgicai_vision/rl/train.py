@@ -56,6 +56,8 @@ contact or holes; relabelled goals mostly do not, and would otherwise lie ten de
 RANDOM_EPISODES = 5
 """Episodes of random actions that give the input statistics if there are no demonstrations."""
 EVALUATED_AT_ONCE = 10
+NOT_A_DISTRIBUTION = "Expected parameter "
+"""How torch's error begins for a distribution with a mean of NaN or a deviation of 0."""
 Weights = Mapping[str, torch.Tensor]
 """Names → parameters of an actor."""
 
@@ -250,7 +252,7 @@ def _run(
     while not is_over:
         target = min((learner.done // request.save_every + 1) * request.save_every, request.total)
         began = time.process_time()
-        losses = learner.advance(target)
+        losses = _advance(request, learner, target)
         minutes += (time.process_time() - began) / 60.0
         actor = actor_of(request, learner)
         curve.append(_evaluate(request, actor, learner, minutes))
@@ -265,6 +267,25 @@ def _run(
             progress(request.total if is_over else learner.done, request.total)
     log.close()
     return _write(request, best, learner.squash, best_point(curve), out)
+
+
+def _advance(request: Request, learner: Learner, target: int) -> dict[str, float]:
+    """Learn until `target`; return the last losses by name.
+
+    Raises:
+        InputError: the actor has diverged.
+    """
+    try:
+        return learner.advance(target)
+    except ValueError as error:
+        if not str(error).startswith(NOT_A_DISTRIBUTION):
+            raise
+        raise _diverged(request, "its distribution of actions is") from error
+
+
+def _diverged(request: Request, what: str) -> InputError:
+    """Return the error for a training whose actor diverged."""
+    return InputError(f"'{request.algo}' diverged: {what} not finite; lower the learning rate.")
 
 
 def _is_over(request: Request, learner: Learner, curve: Sequence[Point]) -> bool:
@@ -416,9 +437,7 @@ def run_of(request: Request) -> RunConfig:
 def _write(request: Request, weights: Weights, squash: str, kept: Point, out: Path) -> Checkpoint:
     """Write the actor with these weights, which are those of the point kept."""
     if not all(torch.isfinite(weight).all() for weight in weights.values()):
-        raise InputError(
-            f"'{request.algo}' diverged: weights are not finite; lower the learning rate."
-        )
+        raise _diverged(request, "weights are")
     recipe = actor_recipe(request, squash)
     checkpoint = Checkpoint(
         run=run_of(request),

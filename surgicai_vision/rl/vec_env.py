@@ -79,8 +79,15 @@ class SuturingVecEnv(VecEnv):
     # -- stepping ----------------------------------------------------------------------------------
 
     def reset(self) -> VecEnvObs:
-        """Reset all envs; seeds set by `seed` and options are used only once."""
-        observation, info = self._vector.reset(seed=list(self._seeds))
+        """Reset all envs; seeds set by `seed` and options set by `set_options` are used only once.
+
+        Raises:
+            InputError: options that differ between envs; the vector env takes one table for all.
+        """
+        options = self._options[0] or None
+        if any((other or None) != options for other in self._options):
+            raise InputError("set_options sets the options of all envs; give one table for all.")
+        observation, info = self._vector.reset(seed=list(self._seeds), options=options)
         self.reset_infos = _rows(info, self.num_envs)
         self._returns[:] = 0.0
         self._lengths[:] = 0

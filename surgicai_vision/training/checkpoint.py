@@ -181,6 +181,11 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     """
     folder = Path(folder)
     if not (folder / CARD).is_file():
+        if folder.is_file():
+            raise BadFile(
+                f"{folder} is a file, not the folder of a checkpoint; of a hierarchical policy, "
+                "give one of the folders that its file names."
+            )
         hint = "its training has not ended" if (folder / REQUEST).exists() else f"no {CARD} in it"
         raise BadFile(
             f"{folder} is not a checkpoint ({hint}); make one with 'surgicai-vision train'."

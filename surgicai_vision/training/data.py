@@ -71,7 +71,7 @@ def split(
     unit = shown if recipe.split == "episode" else _first_variants(episode_index, shown)
     units = np.unique(unit)
     count = round(recipe.validation * len(units))
-    if recipe.validation > 0 and len(units) > 1:
+    if recipe.validation > 0:
         count = min(max(count, 1), len(units) - 1)
     held = np.sort(generator.permutation(units)[:count])
     belongs = np.isin(unit, held)

@@ -118,6 +118,7 @@ class Training:
     def time_epoch(self, clock: Callable[[], float]) -> float:
         """Return an estimate of an epoch's duration [s], from `TIMED` updates and a validation."""
         batches = self._batches()
+        self.schedule = None  # it ends with the last epoch, which these updates may exceed
         self.policy.train()
         for rows in batches[:WARM]:
             self._update(rows)
@@ -140,17 +141,16 @@ class Training:
             return None
         target = self.target[self.held_rows]
         self.policy.eval()
-        self.policy.calibrate(self._answers(self.held_rows), target)
-        if self.request.policy.target != names.STAGE:
-            return None
-        return stage_errors(self._answers(self.held_rows).numpy(), target.numpy())
+        with self._averaged():
+            self.policy.calibrate(self._answers(self.held_rows), target)
+            if self.request.policy.target != names.STAGE:
+                return None
+            return stage_errors(self._answers(self.held_rows).numpy(), target.numpy())
 
     def _answers(self, rows: NDArray[np.int64]) -> torch.Tensor:
         """Return the policy's answers to some frames, (n, …)."""
         pieces = [rows[at : at + STATISTICS_ROWS] for at in range(0, len(rows), STATISTICS_ROWS)]
-        normalised = (
-            self.policy.normalise(self._observed(piece).to(self.device)) for piece in pieces
-        )
+        normalised = (self.policy.normalise(self._inputs(piece)) for piece in pieces)
         return torch.cat([self.policy(observed).cpu() for observed in normalised])
 
     def _optimiser(self) -> tuple[torch.optim.Optimizer, LRScheduler | None]:

@@ -167,6 +167,10 @@ def load_recipe(
         check_name("recipe", str(recipe), recipe_names())
         path = (configs_folder() / "recipes") / f"{recipe}.yaml"
     values: Mapping[str, object] = read_yaml(path, may_be_empty=True)
+    if "epochs" in changes and changes.get(BUDGET):
+        raise InputError(
+            f"epochs={changes['epochs']} and {BUDGET}={changes[BUDGET]} are given; give one."
+        )
     if "epochs" in changes:  # an explicit number of epochs overrides the budget
         values = {key: value for key, value in values.items() if key != BUDGET}
     return from_mapping(plugin.recipe, _changed(values, changes), f"recipe {recipe}")

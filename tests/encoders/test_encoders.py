@@ -13,7 +13,7 @@ import torch
 from photographs import hopper
 from torch import nn
 
-from encoders.base import Encoder, read_torch
+from encoders.base import Encoder, best_dtype, read_torch
 from encoders.card import EncoderCard
 from encoders.imagenet_lite_early import IMAGENET_LITE_EARLY
 from encoders.imagenet_lite_smooth import IMAGENET_LITE_SMOOTH, smoothing
@@ -222,6 +222,49 @@ def test_maps_and_tokens_average_to_the_global_feature(pool: str, shape: tuple[i
     whole = load_encoder("random")
     np.testing.assert_allclose(mean, whole(hopper())[0], rtol=0.02, atol=0.05)
     assert whole.fingerprint != encoder.fingerprint
+
+
+class Mapped(nn.Module):
+    """Means of patches of 8 pixels, with the channels where `output_fmt` says, as timm does."""
+
+    def __init__(self, output_fmt: str) -> None:
+        super().__init__()
+        self.pool = nn.AvgPool2d(8)
+        self.output_fmt = output_fmt
+
+    def forward_features(self, images: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
+        """Return the map, or two maps."""
+        patches = self.pool(images)
+        if self.output_fmt == "NHWC":
+            return patches.permute(0, 2, 3, 1)
+        return patches if self.output_fmt == "NCHW" else [patches, patches]
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        """Return (B, 3) means."""
+        return images.mean((2, 3))
+
+
+@pytest.mark.parametrize(("pool", "shape"), [("spatial", (3, 4, 4)), ("tokens", (16, 3))])
+def test_a_map_is_read_with_its_channels_where_the_network_has_them(
+    pool: str, shape: tuple[int, ...]
+) -> None:
+    """Swin of timm gives (B, h, w, C)."""
+    card = replace(IMAGENET_LITE_EARLY.card, name="own", architecture="mine", dim=3, input_size=32)
+    first, last = (Encoder(card, Mapped(order), pool=pool) for order in ("NCHW", "NHWC"))
+    assert first.shape == last.shape == shape
+    np.testing.assert_array_equal(first(images(2, 32)), last(images(2, 32)))
+    with pytest.raises(InputError, match="several feature maps"):
+        Encoder(card, Mapped("two"), pool=pool)
+
+
+def test_a_gpu_that_only_emulates_bfloat16_computes_in_float32(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def supported(including_emulation: bool = True) -> bool:
+        return including_emulation
+
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", supported)
+    assert best_dtype(torch.device("cuda")) == torch.float32
 
 
 class Shrunk(nn.Module):

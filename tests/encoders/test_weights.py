@@ -11,12 +11,14 @@ from photographs import hopper, photograph
 from safetensors.torch import load_file, save_file
 
 from encoders import imagenet, weights
-from encoders.base import Encoder
+from encoders.base import Encoder, read_torch
+from encoders.packaged import packaged_file
 from surgicai_vision.core.errors import BadFile, InputError, MissingWeights, UnknownName
 from surgicai_vision.core.files import sha256_file
 from surgicai_vision.features.encoders import (
     WeightsSource,
     encoder_card,
+    encoder_plugin,
     find_weights,
     load_encoder,
 )
@@ -51,6 +53,15 @@ def test_r3m_loader(tmp_path: Path) -> None:
     wanted = torch.load(path, weights_only=True)["r3m"]["module.convnet.conv1.weight"].float()
     got = encoder._network.state_dict()["conv1.weight"].float()
     assert torch.allclose(got, wanted, rtol=1e-2)
+
+
+@pytest.mark.parametrize("name", ["r3m-18", "imagenet-lite"])
+def test_a_card_records_the_hash_of_the_file_that_was_loaded(name: str, tmp_path: Path) -> None:
+    own = tmp_path / "file.bin"
+    path = r3m_file(own) if name == "r3m-18" else saved(own, read_torch(packaged_file()))
+    plugin = encoder_plugin(name)
+    card, _ = plugin.build(dataclasses.replace(plugin.card, sha256="published"), path)
+    assert card.sha256 == sha256_file(path)
 
 
 def test_clip_loader_takes_the_image_tower(tmp_path: Path) -> None:
@@ -188,6 +199,21 @@ def test_order_and_hash_of_the_weights_folder(
     (tmp_path / "r3m" / "pytorch_model.bin").write_bytes(b"tampered")
     with pytest.raises(BadFile, match=str(encoder_card("r3m").sha256)):
         find_weights("r3m")
+
+
+def test_every_known_file_may_have_the_encoders_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`imagenet.pth` may hold the first or the second weights of torchvision."""
+    monkeypatch.setenv(weights.FOLDER_VARIABLE, str(tmp_path))
+    path = tmp_path / "imagenet.pth"
+    path.write_bytes(b"weights")
+    second = next(known for known in imagenet.VARIANTS if known.filename.endswith("11ad3fa6.pth"))
+    monkeypatch.setattr(weights, "sha256_file", lambda _: second.sha256 + 56 * "0")
+    assert find_weights("imagenet") == path
+    monkeypatch.setattr(weights, "sha256_file", lambda _: 64 * "0")
+    with pytest.raises(BadFile, match=f"or {second.sha256} or"):
+        find_weights("imagenet")
 
 
 def test_a_bare_filename_is_taken_only_by_its_hash(

@@ -96,6 +96,8 @@ def test_workers_and_repetition_change_nothing(driven, learner, tmp_path):
 def test_a_learner_of_another_task_and_a_folder_without_one_are_refused(learner, tmp_path):
     with pytest.raises(InputError, match="trained for 'place', not for 'grasp'"):
         learner_of(learner.folder, TaskConfig("grasp"))
+    with pytest.raises(InputError, match="is not one trained policy"):
+        learner_of("expert", CONFIG)
     with pytest.raises(BadFile):
         learner_of(tmp_path, CONFIG)
 

@@ -340,6 +340,9 @@ def test_a_policy_that_does_not_act_is_refused_before_any_work(tmp_path):
     grid = Grid(("suture",), ("random",), (("front",),), policy=("hlp",))
     with pytest.raises(InputError, match="write `hierarchical:`"):
         sweep(grid, tmp_path / "out")
+    grid = Grid(("grasp",), ("random",), (("front",),), policy=("actor",))
+    with pytest.raises(InputError, match="'actor' is what an algorithm trains; write `algo:`"):
+        sweep(grid, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="needs task: suture"):
         Grid(("grasp",), ("random",), (("front",),), hierarchical=("learned",))

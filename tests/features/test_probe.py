@@ -74,6 +74,13 @@ def test_features_that_hold_the_pose_are_read_and_noise_is_not() -> None:
     assert noise.tip.median > 0.7 * noise.tip.chance
 
 
+def test_features_that_are_constant_give_the_mean_pose() -> None:
+    dataset = Dataset()
+    found = probe(dataset, [features(np.ones((dataset.length, 8)), dataset)])
+    assert found.tip.median == pytest.approx(found.tip.chance)
+    assert found.angle.median == pytest.approx(found.angle.chance)
+
+
 def test_an_episodes_identity_does_not_help() -> None:
     """Features that only identify the episode fit training episodes and fail on held-out ones."""
     dataset = Dataset()

@@ -184,6 +184,20 @@ def test_images_of_several_sizes_are_refused_before_the_folder_is_begun(tmp_path
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"rollout": 1}, "rollout is 1; it must be at least 2"),
+        ({"batch_size": 1}, "batch_size is 1; it must be at least 2"),
+        ({"entropy": float("nan")}, "entropy is nan"),
+        ({"learning_rate": float("inf")}, "learning_rate is inf"),
+    ],
+)
+def test_settings_that_ppo_cannot_learn_with_are_refused(change, told):
+    with pytest.raises(InputError, match=told):
+        HighLevelSettings(**change)
+
+
 def test_a_learned_termination_is_refused():
     learned = dataclasses.replace(EXPERTS, hlp="outputs/train/hlp", termination="learned")
     with pytest.raises(InputError, match="hlp: order"):

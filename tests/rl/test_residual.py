@@ -11,8 +11,9 @@ from helpers.checkpoints import checkpoint
 from policies.bc import BC
 from policies.residual import Residual, ResidualRecipe
 from surgicai_vision.core import names
-from surgicai_vision.core.config import to_mapping
+from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists
+from surgicai_vision.core.files import read_json
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.rollout import run_share
 from surgicai_vision.rl import residual
@@ -110,6 +111,22 @@ def test_what_is_trained_is_a_checkpoint_that_is_evaluated_as_any(base, tmp_path
     assert not episode.row.error
     with pytest.raises(OutputExists):
         train_residual(request_of(base, seed=1), tmp_path / "residual")
+
+
+def test_control_steps_are_counted_where_an_action_is_held(tmp_path):
+    held = checkpoint(tmp_path / "held", "grasp", env=TaskConfig("grasp", action_repeat=2))
+    shown = []
+    request = request_of(held)
+
+    def show(done, total, unit=""):
+        shown.append((done, total))
+
+    trained = train_residual(request, tmp_path / "residual", progress=show)
+    assert (trained.run.env_steps, trained.frames) == (24, 24)
+    assert shown == [(0, 24), (12, 24), (24, 24)]
+    curve = read_json(tmp_path / "residual" / "curve.json")
+    assert [point["env_steps"] for point in curve] == [12, 24]
+    assert [point["updates"] for point in curve] == [2, 8]  # one a decision, after four
 
 
 def test_the_actor_waits_for_its_critics(base, tmp_path):

@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 
+from policies import base
 from policies.actor import VECTORS
 from surgicai_vision import envs
 from surgicai_vision.commands.main import main
@@ -21,7 +22,7 @@ from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.rl import train as training
 from surgicai_vision.rl.algorithms import ALGORITHMS
-from surgicai_vision.rl.settings import Request, Settings, settings_of
+from surgicai_vision.rl.settings import WIDEST, Request, Settings, settings_of
 from surgicai_vision.rl.train import train
 from surgicai_vision.training.folder import STATE
 from surgicai_vision.training.policies import load_policy
@@ -267,6 +268,11 @@ def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, caps
     assert "at least 0" in refused("td3", "--change", "learning_starts=-1")
     assert "at least 0" in refused("td3", "--change", "exploration_noise=-0.1")
     assert "finite" in refused("td3", "--change", "learning_rate=.inf")
+    for algo, setting in (("ppo", "rollout"), ("ppo", "batch_size"), ("td3", "batch_size")):
+        assert f"{setting} is 1; it must be at least 2" in refused(algo, "--change", f"{setting}=1")
+    with pytest.raises(InputError, match="at most 65536"):
+        settings_of("td3", {"hidden": [65_537]})
+    assert WIDEST == base.WIDEST  # what a policy's recipe allows
     shown = ("--demos", str(demos["grasp"]))
     for algo, share, rows in (("td3-bc", 0.001, 0), ("rlpd", 0.999, 256)):
         assert f"{rows} of the 256" in refused(algo, *shown, "--change", f"demo_share={share}")
@@ -280,6 +286,15 @@ def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, caps
     train(request, list_demos(demos["grasp"]), tmp_path / "a", tensorboard=False)
     with pytest.raises(OutputExists, match="another training"):
         train(replace(request, seed=1), list_demos(demos["grasp"]), tmp_path / "a")
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac"])
+def test_a_training_that_diverges_says_so_in_one_line(algo, demos, tmp_path):
+    """The library's distribution of actions refuses the actor's mean or its deviation."""
+    request, _ = request_of(algo, demos)
+    settings = replace(request.settings, learning_rate=1e10)
+    with pytest.raises(InputError, match=r"diverged.*lower the learning rate"):
+        train(replace(request, settings=settings), [], tmp_path / "out", tensorboard=False)
 
 
 def test_a_missing_extra_is_one_clear_line(tmp_path, capsys, monkeypatch):

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.tasks import env_id
+from surgicai_vision.envs import make
 from surgicai_vision.rl.vec_env import SuturingVecEnv
 
 LIMIT = 6
@@ -79,6 +81,33 @@ def test_a_restored_state_has_the_same_future_over_a_reset(workers):
         ]
     first.close()
     second.close()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_options_hold_for_one_reset_of_all_envs(workers):
+    config = TaskConfig("insert", randomisation=RandomisationConfig(phantom_shift=3.0))
+    options = {"randomisation": {"phantom_shift": [0.002, -0.001]}}
+    envs = SuturingVecEnv.of(config, "state", 2, workers)
+    envs.seed(0)
+    drawn = envs.reset()
+    envs.seed(0)
+    envs.set_options(options)
+    given = envs.reset()
+    single = make(config, "state")
+    wanted = [single.reset(seed=seed, options=options)[0] for seed in (0, 1)]
+    assert same(given, np.stack(wanted)) and not same(given, drawn)
+    envs.seed(0)
+    assert same(envs.reset(), drawn)
+    envs.close()
+    single.close()
+
+
+def test_options_that_differ_between_envs_are_refused():
+    envs = SuturingVecEnv("grasp", 2, obs_type="relative")
+    envs.set_options([{"randomisation": {}}, {"own": 1}])
+    with pytest.raises(InputError, match="one table for all"):
+        envs.reset()
+    envs.close()
 
 
 def test_rewards_of_goals_are_computed_in_this_process():

@@ -1,6 +1,7 @@
 """Chunks of actions: their column, their policies, and how they are executed."""
 
 import datetime
+import importlib
 import math
 from dataclasses import replace
 from functools import partial
@@ -17,6 +18,7 @@ from torch import nn
 from policies.base import ACTIONS, Plugin, Recipe
 from policies.bc import BC
 from policies.chunks import ChunkPolicy, ChunkRecipe
+from policies.lerobot import DIFFUSION, VQBET
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, UnknownName
@@ -34,7 +36,7 @@ from surgicai_vision.report.pairs import factor
 from surgicai_vision.training.averages import MovingAverage
 from surgicai_vision.training.chunks import earlier_rows, timeline_of, with_chunks
 from surgicai_vision.training.loop import Training
-from surgicai_vision.training.policies import POLICIES, load_policy, load_recipe
+from surgicai_vision.training.policies import POLICIES, load_policy, load_recipe, policy_plugin
 from surgicai_vision.training.request import TrainingRequest
 from surgicai_vision.training.run_config import RunConfig, of_training
 from surgicai_vision.training.train import epochs_within, train
@@ -274,6 +276,54 @@ def test_a_budget_is_counted_in_epochs(registered: None) -> None:
         epochs_within(minutes, dataset, [entry], LINEAR, QUICK) for minutes in (0.0001, 1.0)
     )
     assert short == 1 and long > 10
+
+
+def test_a_budget_is_measured_beyond_the_last_step_of_a_schedule() -> None:
+    _, dataset = chunked()
+    short = replace(QUICK, schedule="one_cycle", epochs=1)
+    assert epochs_within(0.0001, dataset, [], LINEAR, short) == 1
+
+
+def test_epochs_and_a_budget_are_not_both_given() -> None:
+    with pytest.raises(InputError, match="epochs=3 and minutes=1 are given"):
+        load_recipe("act", "act", {"epochs": 3, "minutes": 1})
+    assert load_recipe("act", "act", {"epochs": 3, "minutes": 0}).epochs == 3
+
+
+@pytest.mark.parametrize(
+    ("policy", "settings"),
+    [
+        ("diffusion", {"num_inference_steps": 101}),
+        ("diffusion", {"num_inference_steps": 0}),
+        ("vqbet", {"bet_softmax_temperature": 0.0}),
+    ],
+)
+def test_settings_with_which_a_policy_learns_but_cannot_plan_are_refused(
+    policy: str, settings: dict[str, float]
+) -> None:
+    recipe = ChunkRecipe(settings=dict(settings))
+    with pytest.raises(InputError, match=f"settings: {next(iter(settings))} is"):
+        policy_plugin(policy).make(recipe, ())
+
+
+def test_a_policy_of_lerobot_is_made_without_a_word_and_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """VQ-BeT prints its size, and stdout may be the JSON of `--json`."""
+
+    def made(recipe: ChunkRecipe, visual: object) -> Linear:
+        print("number of parameters: 0.89M")
+        return Linear(recipe, ())
+
+    def indexing(recipe: ChunkRecipe, visual: object) -> Linear:
+        raise IndexError("tuple index out of range")
+
+    adapter = SimpleNamespace(VqBet=made, Diffusion=indexing)
+    monkeypatch.setattr(importlib, "import_module", lambda _: adapter)
+    assert isinstance(VQBET.make(QUICK, ()), Linear)
+    assert not capsys.readouterr().out
+    with pytest.raises(InputError, match=r"Diffusion cannot be made .*tuple index"):
+        DIFFUSION.make(QUICK, ())
 
 
 def test_the_average_is_the_weighted_sum_of_all_weights() -> None:

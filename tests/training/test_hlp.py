@@ -56,6 +56,12 @@ def test_its_errors_are_those_on_the_episodes_held_out(trained: Path) -> None:
     assert found.calibration_error == pytest.approx(again.calibration_error, abs=1e-4)
 
 
+@pytest.mark.parametrize("name", ["privileged", "setpoint", "progress_input"])
+def test_inputs_that_it_does_not_read_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match=f"leave '{name}' off"):
+        HLPRecipe(**{name: True})
+
+
 def test_without_progress_it_is_the_policy_it_was(tmp_path: Path) -> None:
     recipe = replace(RECIPE, progress=0.0, epochs=2)
     train(procedures(), [], HLP, recipe, out=tmp_path / "a")

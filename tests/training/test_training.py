@@ -12,7 +12,7 @@ import pytest
 import torch
 from fake_dataset import DIM, FakeDataset, features_of
 
-from policies.base import Plugin, Policy, Recipe
+from policies.base import ACTIONS, Inputs, Plugin, Policy, Recipe
 from policies.bc import BC
 from policies.chunks import ChunkRecipe
 from policies.layers import MapConvolutions, SpatialSoftmax
@@ -28,6 +28,7 @@ from surgicai_vision.training.checkpoint import (
     check_encoder,
     check_task,
     read_checkpoint,
+    read_tensors,
     write_checkpoint,
 )
 from surgicai_vision.training.data import split
@@ -123,6 +124,52 @@ def test_split_is_by_episode() -> None:
     assert sorted([*rows, *held]) == list(range(len(index)))
     again = split(index, Recipe(), seed=3)[2]
     assert again == episodes and split(index, Recipe(), seed=4)[2] != episodes
+
+
+def test_a_single_episode_is_trained_on_whatever_the_share_held_out() -> None:
+    rows, held, episodes = split(np.zeros(7, np.int64), Recipe(validation=0.6), seed=0)
+    assert (len(rows), len(held), episodes) == (7, 0, ())
+
+
+def test_a_policy_acts_by_the_weights_that_it_was_given_last() -> None:
+    first, second = (BC.make(QUICK, ((4,),)).eval() for _ in range(2))
+    seen = np.ones((2, 4), np.float32), np.ones((2, 7), np.float32)
+    assert not np.array_equal(first.act(*seen), second.act(*seen))
+    first.load_state_dict(second.state_dict())
+    np.testing.assert_array_equal(first.act(*seen), second.act(*seen))
+
+
+class Averaged(Policy):
+    """A policy whose average is kept, and that notes the first answer it is calibrated on."""
+
+    answer: torch.Tensor
+    averaging = 0.99
+
+    def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
+        super().__init__(Inputs(visual))
+        self.layer = torch.nn.Linear(self.inputs.dim, ACTIONS)
+        self.register_buffer("answer", torch.zeros(ACTIONS))
+
+    def forward(self, observed: torch.Tensor) -> torch.Tensor:
+        actions: torch.Tensor = self.layer(observed)
+        return actions
+
+    def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.mse_loss(self(observed), target)
+
+    def calibrate(self, answers: torch.Tensor, target: torch.Tensor) -> None:
+        self.answer.copy_(answers[0])
+
+
+def test_a_policy_is_calibrated_with_the_weights_that_are_kept(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    plugin = Plugin("averaged", Recipe, Averaged)
+    checkpoint = train(dataset, [], plugin, QUICK, out=tmp_path / "a")
+    held = np.isin(dataset.episode_index, checkpoint.validation_episodes)
+    policy = Averaged(QUICK, ())
+    policy.load_state_dict(read_tensors(checkpoint))
+    (answer,) = policy.act(None, dataset.columns()[names.STATE][held][:1].astype(np.float32))
+    np.testing.assert_allclose(policy.answer, answer, atol=1e-5)
 
 
 def test_training_learns_and_reads_back(tmp_path: Path) -> None:
@@ -411,6 +458,9 @@ def test_tampered_checkpoints_are_refused(tmp_path: Path) -> None:
         load_policy(folder)
     with pytest.raises(BadFile, match="not a checkpoint"):
         load_policy(tmp_path)
+    (tmp_path / "hierarchical.yaml").write_text("hlp: order")
+    with pytest.raises(BadFile, match="is a file, not the folder of a checkpoint"):
+        load_policy(tmp_path / "hierarchical.yaml")
     seeing = train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "seeing")
     assert seeing.encoder is not None
     card_alone = replace(seeing, encoder=replace(seeing.encoder, card={"mean": 0}))

@@ -23,6 +23,7 @@ from surgicai_vision.experiments.sweep.rl_grid import RLGrid
 from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice, is_chosen
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import WeightsSource
+from surgicai_vision.rl.algorithms import LEARNED
 from surgicai_vision.rl.extra import check_extra
 from surgicai_vision.training import policies
 from surgicai_vision.training.run_config import OWN, RunConfig
@@ -143,8 +144,8 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
     Raises:
         UnknownName: a recipe, or a change of one, that does not exist.
         InputError: a recipe with progress as an input, which no sweep provides, a policy that
-            chooses subtasks where one that acts is needed, a dataset that cannot be recorded or
-            rendered, or upsets in a task that has none.
+            only an algorithm trains, one that chooses subtasks where one that acts is needed, a
+            dataset that cannot be recorded or rendered, or upsets in a task that has none.
     """
     if any(run.algo for run in experiment.runs):
         check_extra("A sweep over algorithms", *LIBRARIES)
@@ -158,6 +159,7 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
             continue
         for trained in trained_by(experiment, run):
             if not trained.by_lerobot_train and not trained.algo:
+                _check_imitates(trained.policy)
                 policies.check_progress_from(policies.recipe_of(trained), None)
         if not experiment.parts(run):
             _check_acts(run.policy)
@@ -191,6 +193,14 @@ def _check_acts(policy: str) -> None:
         f"policy: '{policy}' chooses subtasks and does not act; it is evaluated over a policy for "
         "each subtask: write `hierarchical:` instead (docs/sweeps.md)."
     )
+
+
+def _check_imitates(policy: str) -> None:
+    """Refuse a policy that does not learn from demonstrations alone."""
+    if policy in LEARNED:
+        raise InputError(
+            f"policy: '{policy}' is what an algorithm trains; write `algo:` instead (docs/rl.md)."
+        )
 
 
 def _missing(encoder: str, weights: WeightsSource) -> str:
