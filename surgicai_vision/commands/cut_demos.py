@@ -10,6 +10,7 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import DIRECTORY, SUBTASK, default_text
 from surgicai_vision.core import names
+from surgicai_vision.core.words import plural
 
 app = App(
     name="cut-demos",
@@ -47,6 +48,6 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     out = options.out or folders.demos_folder(f"{options.subtask}-visits")
     folders.check_folder(out, MARKER)
     paths = cut_demos(demos, options.subtask, out=out, stage=console.stage)
-    console.say(f"{len(paths)} visits of {options.subtask}: {out}")
+    console.say(f"{plural(len(paths), 'visit')} of {options.subtask}: {out}")
     console.say(f"next: surgicai-vision render-demos --demos {out}")
     return {"visits": len(paths), "out": str(out)}

@@ -11,6 +11,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import COUNT, DIRECTORY, TASK, EnvFields, default_text
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.words import plural
 
 app = App(
     name="export-demos",
@@ -74,7 +75,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     written = export.write(transitions, options.format, out)
     left_out = f", {transitions.failed} left out" if transitions.failed else ""
     console.say(
-        f"{len(transitions)} transitions of {transitions.episodes} episodes{left_out}: {written}"
+        f"{plural(len(transitions), 'transition')} of {plural(transitions.episodes, 'episode')}"
+        f"{left_out}: {written}"
     )
     return {
         "transitions": len(transitions),

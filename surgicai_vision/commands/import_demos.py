@@ -13,6 +13,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import DIRECTORY, FILE_ONLY, SUBTASK, EnvFields, default_text
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, check_name
+from surgicai_vision.core.words import plural
 from surgicai_vision.demos.imports.rosbag.config import (
     CONVENTIONS,
     SEGMENTATIONS,
@@ -122,11 +123,13 @@ def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str
     with console.stage(f"importing {options.task}", "episodes") as progress:
         summary = import_demos(path, task=options.task, out=out, progress=progress)
     console.say(
-        f"{len(summary.paths)} demonstrations of {options.task}, {summary.steps} steps: {out}"
+        f"{plural(len(summary.paths), 'demonstration')} of {options.task}, "
+        f"{plural(summary.steps, 'step')}: {out}"
     )
     if summary.skipped:
         console.say(
-            f"{len(summary.skipped)} episodes could not be replayed; {out}/demos.json says why."
+            f"{plural(len(summary.skipped), 'episode')} could not be replayed; "
+            f"{out}/demos.json says why."
         )
     return {
         "task": options.task,
@@ -212,12 +215,13 @@ def _told(summaries: "Sequence[BagSummary]", console: Console) -> dict[str, dict
     for made in summaries:
         kept = len(made.paths)
         console.say(
-            f"{kept} demonstrations of {made.task}, {made.steps} steps; {made.succeeded} of {kept} "
-            f"end in success by our tolerances: {made.out}"
+            f"{plural(kept, 'demonstration')} of {made.task}, {plural(made.steps, 'step')}; "
+            f"{made.succeeded} of {kept} end in success by our tolerances: {made.out}"
         )
         if made.skipped:
             console.say(
-                f"{len(made.skipped)} parts could not be replayed; {made.out}/demos.json says why."
+                f"{plural(len(made.skipped), 'part')} could not be replayed; "
+                f"{made.out}/demos.json says why."
             )
         if made.clipped:
             console.say(

@@ -9,6 +9,7 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import default_text
+from surgicai_vision.core.words import plural
 
 app = App(
     name="leaderboard",
@@ -45,7 +46,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     board = write_leaderboard(options.dir, page)
     for name, reason in board.refused.items():
         console.say(f"rejected: {name}: {reason}")
-    console.say(f"{len(board.taken)} rows: {board.page}")
+    console.say(f"{plural(len(board.taken), 'row')}: {board.page}")
     return {
         "page": str(board.page),
         "taken": len(board.taken),

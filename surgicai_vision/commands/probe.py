@@ -21,6 +21,7 @@ from surgicai_vision.commands.options import (
     default_text,
 )
 from surgicai_vision.core.files import check_output, write_json
+from surgicai_vision.core.words import plural
 from surgicai_vision.features import encoders
 
 if TYPE_CHECKING:
@@ -130,4 +131,6 @@ def line(row: dict[str, Any]) -> str:
         )
         parts.append(f"{value:.2f} {unit} ({low:.2f}–{high:.2f}; mean pose {chance:.2f})")
     tip, angle = parts
-    return f"{row['encoder']} {row['view']}: tip {tip}, angle {angle}, {row['n']} episodes"
+    return (
+        f"{row['encoder']} {row['view']}: tip {tip}, angle {angle}, {plural(row['n'], 'episode')}"
+    )

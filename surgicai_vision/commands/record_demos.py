@@ -24,6 +24,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.percentages import interval
+from surgicai_vision.core.words import plural
 from surgicai_vision.demos.demonstrator import CHOOSING_DEMONSTRATORS, SOURCES
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     marker = read_marker(out)
     tried = len(paths) + len(marker["skipped"])
     bounds = clopper_pearson(len(paths), tried)
-    console.say(f"{len(paths)} demonstrations of {options.task}: {out}")
+    console.say(f"{plural(len(paths), 'demonstration')} of {options.task}: {out}")
     console.say(
         f"{len(paths)}/{tried} starts succeeded (95 % interval {interval(bounds)})"
         + (f"; {out / MARKER} lists the others." if tried > len(paths) else ".")

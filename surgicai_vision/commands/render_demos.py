@@ -30,6 +30,7 @@ from surgicai_vision.core.config import RANDOMISATION_CHOICES
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import check_renamed
 from surgicai_vision.core.variants import Variants
+from surgicai_vision.core.words import plural
 
 app = App(
     name="render-demos",
@@ -147,7 +148,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         context=context,
     )
     console.say(
-        f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}"
+        f"{plural(summary.episodes, 'episode')}, {plural(summary.frames, 'frame')} "
+        f"in {summary.seconds:.0f} s: {out}"
     )
     print_video_error(summary.video_error, console)
     return {

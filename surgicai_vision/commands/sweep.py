@@ -19,6 +19,7 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName
 from surgicai_vision.core.files import check_output, configs_folder, read_yaml
+from surgicai_vision.core.words import plural
 from surgicai_vision.experiments.plan_config import is_plan, read_plan
 from surgicai_vision.experiments.sweep.grid import AXES, Grid
 from surgicai_vision.experiments.sweep.rl_grid import RLGrid
@@ -116,7 +117,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     for line in result.pop("problems"):
         console.say(line)
     told = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in COUNTS)
-    console.say(f"{result['runs']} runs: {told}; {out}")
+    console.say(f"{plural(result['runs'], 'run')}: {told}; {out}")
     failed = result["failed"] or result["failed_beside"]
     return {**result, "exit_code": 1 if failed else 0}
 
@@ -134,7 +135,7 @@ def _list(
         again = state.reason and state.state != NOT_RUN
         console.say(f"{line}: {state.reason}" if again else line)
     for reason, runs in lacking(states).items():
-        console.say(f"not run, {len(runs)} runs: {reason}")
+        console.say(f"not run, {plural(len(runs), 'run')}: {reason}")
     counts = {
         name.replace(" ", "_"): sum(state.state == name for state in states) for name in STATES
     }
@@ -145,7 +146,7 @@ def _list(
         if seconds is None
         else f"about {_duration(seconds)} with {workers} workers, judging by the finished ones"
     )
-    console.say(f"{len(states)} runs: {told}; {rest}.")
+    console.say(f"{plural(len(states), 'run')}: {told}; {rest}.")
     return {"runs": len(states), **counts, "seconds": seconds, "dry_run": True}
 
 

@@ -24,6 +24,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.tasks import task_text
+from surgicai_vision.core.words import plural
 from surgicai_vision.teleoperation.keyboard import key_table
 
 app = App(
@@ -123,7 +124,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             )
     env.close()
     count = len(recordings.seeds)
-    total = f"{count} demonstrations: {out}" if count else "no demonstrations yet."
+    total = f"{plural(count, 'demonstration')}: {out}" if count else "no demonstrations yet."
     console.say(f"{session.kept} kept, {session.discarded} discarded; {total}")
     return {
         "task": options.task,

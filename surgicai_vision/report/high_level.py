@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 from surgicai_vision.core import names, percentages
 from surgicai_vision.core.config import from_mapping
-from surgicai_vision.report import charts, text
+from surgicai_vision.core.words import plural
+from surgicai_vision.report import charts
 from surgicai_vision.report.reader import Result
 from surgicai_vision.training.checkpoint import StageErrors
 
@@ -56,7 +57,7 @@ def _shown(results: list[Result]) -> HighLevel:
     errors = from_mapping(StageErrors, first.high_level["stage_errors"], str(first.folder))
     labels = dict.fromkeys(f"{one.condition.policy}, seed {one.seed}" for one in results)
     said = [
-        f"{errors.right} of {text.plural(errors.frames, 'frame')} predicted correctly "
+        f"{errors.right} of {plural(errors.frames, 'frame')} predicted correctly "
         f"({percentages.percent(errors.right / errors.frames)})",
         f"calibration error {errors.calibration_error:.3f}",
     ]

@@ -8,7 +8,8 @@ from markupsafe import Markup
 
 from surgicai_vision.core import names, percentages
 from surgicai_vision.core.tasks import task_names
-from surgicai_vision.report import charts, curves, paper, sections, text
+from surgicai_vision.core.words import noun, plural
+from surgicai_vision.report import charts, curves, paper, sections
 from surgicai_vision.report.episodes import group_details, letters
 from surgicai_vision.report.filmstrips import Reel
 from surgicai_vision.report.groups import (
@@ -142,14 +143,13 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
     best = [found for task in tasks if (found := best_trained(of_task(evaluated, task)))]
     if not best:
         return {
-            "headline": f"References on {text.plural(len(tasks), 'task')}",
+            "headline": f"References on {plural(len(tasks), 'task')}",
             "lead": "No trained policy was run.",
         }
     if not any(item.successes for item in best):
         episodes = sum(item.episodes for item in evaluated if item.condition.trained)
         sentence = (
-            f"No trained policy solves any of its {starts_of(best)} of"
-            f" {text.plural(len(best), 'task')}"
+            f"No trained policy solves any of its {starts_of(best)} of {plural(len(best), 'task')}"
         )
         return {
             "headline": sentence,
@@ -179,7 +179,8 @@ def _counts(collected: Collected) -> list[tuple[int, str]]:
     states = [cell.state for cell in collected.missing]
     counts = [(trained, "done"), *((states.count(state), state) for state in sorted(set(states)))]
     episodes = sum(len(result.rows) for result in collected.results)
-    return [(trained + len(states), "runs"), *counts, (episodes, "episodes")]
+    runs = trained + len(states)
+    return [(runs, noun(runs, "run")), *counts, (episodes, noun(episodes, "episode"))]
 
 
 def details(groups: Sequence[Group], reel: Reel, commands: dict[str, list[str]]) -> Markup:
@@ -200,5 +201,5 @@ def details(groups: Sequence[Group], reel: Reel, commands: dict[str, list[str]])
 
 def footer(collected: Collected) -> str:
     """Return when and from what the page was written."""
-    count = text.plural(len(collected.results), "stored evaluation")
+    count = plural(len(collected.results), "stored evaluation")
     return f"Written on {datetime.date.today().isoformat()} from {count}."

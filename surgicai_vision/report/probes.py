@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from surgicai_vision.core import percentages
+from surgicai_vision.core.words import plural
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Point, Series
@@ -159,7 +160,7 @@ def _correlations(pairs: Sequence[tuple[ProbeRow, Point]]) -> str:
 
 def _correlation(pairs: Sequence[tuple[float, float]]) -> str:
     if len(pairs) < FEWEST:
-        return f"{text.plural(len(pairs), 'pair')}, too few"
+        return f"{plural(len(pairs), 'pair')}, too few"
     errors, rates = np.array(pairs).T
     if len(set(errors)) == 1 or len(set(rates)) == 1:
         return f"{len(pairs)} pairs, all equal in one of the two"

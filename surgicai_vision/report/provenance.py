@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from surgicai_vision.core.banks import USES, bank_of
+from surgicai_vision.core.words import plural
 from surgicai_vision.report import text
 from surgicai_vision.report.groups import Group
 from surgicai_vision.report.reader import Collected, Result
@@ -89,7 +90,7 @@ def _starts(results: Sequence[Result]) -> str:
     for seed in sorted({row["seed"] for result in results for row in result.rows}, reverse=True):
         found.setdefault(bank_of(seed), []).insert(0, seed)
     return "; ".join(
-        f"{seeds[0]}–{seeds[-1]} ({text.plural(len(seeds), 'start')}), {USES[bank]}"
+        f"{seeds[0]}–{seeds[-1]} ({plural(len(seeds), 'start')}), {USES[bank]}"
         for bank, seeds in found.items()
     )
 

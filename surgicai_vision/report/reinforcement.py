@@ -19,6 +19,7 @@ from markupsafe import Markup
 
 from surgicai_vision.core import files, names, percentages
 from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.words import plural
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import aggregates, charts, paper, text
 from surgicai_vision.report.charts import Point, Series
@@ -168,12 +169,12 @@ def _cells(row: Row, tasks: Sequence[str]) -> tuple[str, ...]:
         if item is None:
             cells.append(text.ABSENT + beside)
             continue
-        seeds = f", {text.plural(len(item.results), 'seed')}"
+        seeds = f", {plural(len(item.results), 'seed')}"
         count = f"{item.successes}/{item.episodes}{seeds}"
         cells.append(f"{count} ({percentages.interval(item.interval)}){beside}")
     mean, bounds, runs, of_tasks = row.aggregate
-    middle = f"{mean:.2f} ({bounds[0]:.2f}–{bounds[1]:.2f}); {text.plural(runs, 'run')}"
-    return (row.label, *cells, f"{middle}, {text.plural(of_tasks, 'task')}")
+    middle = f"{mean:.2f} ({bounds[0]:.2f}–{bounds[1]:.2f}); {plural(runs, 'run')}"
+    return (row.label, *cells, f"{middle}, {plural(of_tasks, 'task')}")
 
 
 def _better(best: Row, other: Row) -> tuple[str, ...]:

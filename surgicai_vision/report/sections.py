@@ -6,6 +6,7 @@ from markupsafe import Markup
 
 from surgicai_vision.core import names, percentages
 from surgicai_vision.core.tasks import task_names
+from surgicai_vision.core.words import plural
 from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.evaluation.statistics import clopper_pearson
 from surgicai_vision.report import charts, paper, text
@@ -216,8 +217,7 @@ def _note(item: Group) -> str:
     if not item.episodes or not states:
         return ""
     parts = [
-        f"{text.plural(states.count(state), 'training seed')} {state}"
-        for state in dict.fromkeys(states)
+        f"{plural(states.count(state), 'training seed')} {state}" for state in dict.fromkeys(states)
     ]
     return ", ".join(parts)
 

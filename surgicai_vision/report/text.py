@@ -63,8 +63,3 @@ def probability(p: float, sign: str = "") -> str:
     `sign` comes before a number that is given exactly.
     """
     return "< 0.001" if p < 0.001 else f"{sign}{p:.3f}"
-
-
-def plural(count: int, word: str) -> str:
-    """Return "1 cell" or "2 cells"."""
-    return f"{count} {word}" + ("" if count == 1 else "s")

@@ -20,6 +20,7 @@ from surgicai_vision.core.files import check_output
 from surgicai_vision.core.hub import connect, refusals_in_one_line
 from surgicai_vision.core.percentages import interval
 from surgicai_vision.core.tasks import task_text
+from surgicai_vision.core.words import plural
 from surgicai_vision.scene import build_scene
 from surgicai_vision.training.checkpoint import CARD, WEIGHTS, Checkpoint, read_checkpoint
 from surgicai_vision.training.policies import restore
@@ -128,6 +129,7 @@ def _facts(checkpoint: Checkpoint) -> dict[str, str]:
     """Return the facts about a policy for its card, by name."""
     encoder = checkpoint.encoder
     held_out = len(checkpoint.validation_episodes)
+    demonstrations = checkpoint.run.demonstrations or 0  # None for an actor that learned without
     facts = {
         "policy": (
             f"`{checkpoint.policy}`, recipe `{checkpoint.run.recipe_label}`, "
@@ -137,7 +139,7 @@ def _facts(checkpoint: Checkpoint) -> dict[str, str]:
         "views": ", ".join(checkpoint.views) or "none",
         "images": f"{checkpoint.image_size} × {checkpoint.image_size} pixels",
         "proprioception": "yes" if checkpoint.proprioception else "no",
-        "data": f"{checkpoint.run.demonstrations} demonstrations, {held_out} of them held out",
+        "data": f"{plural(demonstrations, 'demonstration')}, {held_out} of them held out",
         "frames": str(checkpoint.frames),
         "dataset, fingerprint": f"`{checkpoint.dataset}`",
         "scene, sha256": f"`{build_scene(checkpoint.task.scene).hash}`",

@@ -64,7 +64,7 @@ def test_the_card_tells_data_recipe_seed_scene_successes_and_licence(policy: Pat
         "recipe `paper`",
         "learning_rate: 0.001",
         "| training seed | 0 |",
-        "1 demonstrations, 0 of them held out",
+        "1 demonstration, 0 of them held out",
         "18/20 (95 % interval 68–99 %), start seeds 7 to 26",
         "| licence | cc-by-4.0 |",
     ):

@@ -9,6 +9,7 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import DIRECTORY
+from surgicai_vision.core.words import plural
 
 app = App(
     name="check",
@@ -42,5 +43,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         if report.ok
         else f"{len(report.problems)} problems; `lerobot-salvage repair` keeps what is whole"
     )
-    console.say(f"{report.episodes} episodes, {report.frames} frames: {verdict}")
+    console.say(
+        f"{plural(report.episodes, 'episode')}, {plural(report.frames, 'frame')}: {verdict}"
+    )
     return {**dataclasses.asdict(report), "ok": report.ok, "exit_code": 0 if report.ok else 1}

@@ -12,6 +12,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import COUNT, DIRECTORY, VIDEO, VIEWS, default_text
 from surgicai_vision.commands.render_demos import print_video_error
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.words import plural
 
 app = App(
     name="convert",
@@ -64,7 +65,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         context=RunContext(options.workers, stage=console.stage),
     )
     console.say(
-        f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}"
+        f"{plural(summary.episodes, 'episode')}, {plural(summary.frames, 'frame')} "
+        f"in {summary.seconds:.0f} s: {out}"
     )
     print_video_error(summary.video_error, console)
     return {**dataclasses.asdict(summary), "dataset": str(out)}

@@ -9,6 +9,7 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import DIRECTORY, default_text
+from surgicai_vision.core.words import plural
 
 app = App(
     name="pull",
@@ -44,7 +45,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     out = options.out or folders.dataset_folder(options.repo.partition("/")[2] or options.repo)
     with console.stage("checking") as progress:
         report = pull_dataset(options.repo, out, revision=options.revision, progress=progress)
-    console.say(f"{report.episodes} episodes, {report.frames} frames: {out}")
+    console.say(f"{plural(report.episodes, 'episode')}, {plural(report.frames, 'frame')}: {out}")
     return {
         "repo": options.repo,
         "dataset": str(out),
