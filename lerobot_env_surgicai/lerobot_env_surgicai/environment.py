@@ -142,6 +142,8 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
             config = trained.task
             image_size = trained.image_size
             cameras = list(dict.fromkeys(map(names.camera_of, trained.views))) or cameras
+        if self.task and self.task != config.task:  # another task has its own limit
+            config = dataclasses.replace(config, task=self.task, max_steps=0)
         for key in TASK_FIELDS:
             if getattr(self, key) is None:
                 setattr(self, key, getattr(config, key))

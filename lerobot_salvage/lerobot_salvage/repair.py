@@ -20,9 +20,15 @@ from pathlib import Path
 from lerobot_salvage.check import check_dataset
 from lerobot_salvage.verify import Verified, Verifier, claimed_episodes, task_name
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import BadFile, SurgicaiError
+from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
 from surgicai_vision.core.executor import claim, work_folder
-from surgicai_vision.core.files import check_output, sync_folder, whole_folder, write_json
+from surgicai_vision.core.files import (
+    check_output,
+    check_renamed,
+    sync_folder,
+    whole_folder,
+    write_json,
+)
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.check import CheckReport
@@ -76,6 +82,7 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress = sil
 
     Raises:
         BadFile: `path` is not a LeRobot dataset, or contains no whole episode.
+        InputError: the result cannot be renamed to `out`, or to `path` without it.
         OutputExists: `out` is not empty.
     """
     before = _checked(path)
@@ -85,6 +92,12 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress = sil
         return Repair(path, before.episodes, before.frames, claimed, None, ())
     if out is not None:
         check_output(out)
+        check_renamed(out)
+    elif path.name in ("", ".."):
+        raise InputError(
+            f"{path} is the current folder or one above it, which cannot be replaced; give --out "
+            "DIR, or run the command elsewhere."
+        )
     elif _free(path, "broken") is None:
         raise BadFile(f"100 broken datasets already exist next to {path}; give --out DIR.")
     work = work_folder(out or path)

@@ -13,6 +13,7 @@ import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -27,6 +28,7 @@ from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.lerobot_files import MOST_TASKS, LeRobotFiles
 from surgicai_vision.dataset.metadata import Features, row_statistics
+from surgicai_vision.dataset.reader import VIDEO_PLACE
 from surgicai_vision.dataset.rules import ImageWatch, episode_problems, number_problems
 from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import ImageStatistics, Statistics, column_statistics
@@ -251,13 +253,17 @@ class Verifier:
         """
         files = self.video_files[key]
         row = self.files.rows[number] if number < len(self.files.rows) else {}
-        if row.get(f"videos/{key}/from_timestamp") is not None:
-            named = self.files.video_file(
-                key, row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
-            )
+        place: list[Any] = [row.get(f"videos/{key}/{name}") for name in VIDEO_PLACE]
+        chunk, number_in_chunk, begin = place
+        if begin is not None:
+            try:
+                named = self.files.video_file(key, chunk, number_in_chunk)
+                first = round(begin * self.files.fps)
+            except (OverflowError, TypeError, ValueError):  # missing, no number, or infinite
+                raise _Unfit(f"its place in the videos of {key} is not numbers.") from None
             if named not in files:
                 raise _Unfit(f"the video {named.relative_to(self.files.path)} is missing.")
-            return files.index(named), round(row[f"videos/{key}/from_timestamp"] * self.files.fps)
+            return files.index(named), first
         file, first = self._ends[key]
         if file < len(files) and first and self._length(files[file]) == first:
             file += 1

@@ -5,11 +5,12 @@ crop of a camera's image is registered, named and requested like a camera.
 """
 
 import zlib
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, check_name, shown
-from surgicai_vision.core.plugins import CAMERAS_GROUP, Registry
+from surgicai_vision.core.plugins import CAMERAS_GROUP, NameCollision, Registry
 
 if TYPE_CHECKING:
     from surgicai_vision.scene.cameras import Camera
@@ -78,16 +79,18 @@ def camera_number(name: str) -> int:
 
 
 def other_cameras() -> tuple[str, ...]:
-    """Return the names of the cameras that are not ours.
+    """Return the names of the cameras that are not ours and that one distribution alone offers.
 
     Raises:
         InputError: a name that no camera can have.
     """
-    others = camera_names()[len(names.CAMERAS) :]
-    for name in others:
+    others: list[str] = []
+    for name in camera_names()[len(names.CAMERAS) :]:
         with CAMERAS.calling(name):
             _check_form(name)
-    return others
+        with suppress(NameCollision):  # refused where it is used (`check_camera`)
+            others.append(CAMERAS.check(name))
+    return tuple(others)
 
 
 def _check_form(name: str) -> None:

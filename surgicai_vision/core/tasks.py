@@ -7,6 +7,7 @@
 """
 
 import importlib.util
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.abc import MetaPathFinder
@@ -15,7 +16,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Final, cast
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import shown
+from surgicai_vision.core.errors import InputError, shown
 from surgicai_vision.core.plugins import TASKS_GROUP, Registry, subclass_of
 
 if TYPE_CHECKING:
@@ -25,6 +26,9 @@ SUBTASK_STEPS: Final = 200
 """Control steps a subtask may take (paper, image policies)."""
 NEEDED: Final = ("name", "arm", "tolerances", "demands")
 """Attributes that a task's class must define."""
+NAMELESS: Final = "cannot have this name; its author must choose one of letters, digits and _"
+FORM: Final = re.compile(r"[\w:.-]+")
+"""What gymnasium takes in an id, and so in a task's name."""
 _is_subtask = subclass_of("surgicai_vision.envs.subtask:Subtask")
 
 
@@ -82,6 +86,8 @@ def load_subtask(name: str) -> "type[Subtask]":
             name.
     """
     subtask = TASKS.load(name)
+    if not FORM.fullmatch(name):
+        raise TASKS.refusal(name, NAMELESS)
     if subtask.name != name:
         raise TASKS.refusal(
             name,
@@ -113,9 +119,13 @@ def register_task(subtask: "type[Subtask]", distribution: str = "") -> None:
 
     Raises:
         NameCollision: the name is taken.
-        InputError: this is not a task, or it lacks something.
+        InputError: this is not a task, it lacks something, or no task can have its name.
     """
-    TASKS.register(getattr(subtask, "name", shown(subtask)), subtask, distribution)
+    name = getattr(subtask, "name", shown(subtask))
+    TASKS.register(name, subtask, distribution)
+    if not FORM.fullmatch(name):
+        TASKS.unregister(name)
+        raise InputError(f"The task '{name}' {NAMELESS}.")
     register_ids()
 
 
@@ -160,9 +170,10 @@ class _GymnasiumFinder(MetaPathFinder):
 
 
 def _register_all() -> None:
-    """Register the id of every task."""
+    """Register the id of every task; one whose name cannot be an id is refused where it is used."""
     for task in task_names():
-        _register_id(task)
+        if FORM.fullmatch(task):
+            _register_id(task)
 
 
 def _register_id(task: str) -> None:

@@ -3,11 +3,11 @@
     report = check_dataset(Path("dataset"))
     report.ok, report.problems        # one line per problem
 
-`meta/surgicai.json` and LeRobot's `meta/info.json`, `meta/episodes` and `meta/stats.json` must
-agree with the data and with each other. Index columns must be gapless and in order, and every
-number finite. Every image must decode, have the right size, not be of one colour, and differ from
-the previous one if the arm or the needle moved; depth must be positive. The digest of the decoded
-content must be the one recorded at rendering.
+`meta/surgicai.json` and LeRobot's `meta/info.json`, `meta/tasks.parquet`, `meta/episodes` and
+`meta/stats.json` must agree with the data and with each other. Index columns must be gapless and in
+order, and every number finite. Every image must decode, have the right size, not be of one colour,
+and differ from the previous one if the arm or the needle moved; depth must be positive. The digest
+of the decoded content must be the one recorded at rendering.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ from surgicai_vision.core.files import read_json
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset import schema
-from surgicai_vision.dataset.lerobot_files import EPISODES, INFO
+from surgicai_vision.dataset.lerobot_files import EPISODES, INFO, TASKS
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.rules import ImageWatch, episode_problems, number_problems
 from surgicai_vision.dataset.stats import column_statistics
@@ -135,12 +135,17 @@ def _check_lerobot(
         counts = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
         files = sorted(dataset.path.glob(EPISODES))
         table = pa.concat_tables(pq.read_table(file, columns=counts) for file in files)
+        tasks = pq.read_table(dataset.path / TASKS).num_rows
     except (BadFile, OSError, ValueError, pa.ArrowException) as error:
         problems.append(f"LeRobot's metadata cannot be read ({first_line(error)}).")
         return
     bounds = dataset.bounds()
     if (info.get("total_frames"), info.get("total_episodes")) != (dataset.length, len(bounds)):
         problems.append("meta/info.json: its counts differ from the data.")
+    if info.get("fps") != dataset.fps:
+        problems.append(f"meta/info.json: its fps is not {dataset.fps}.")
+    if not tasks:
+        problems.append(f"{TASKS}: it holds no task.")
     own = schema.columns(dataset.views)
     missing = [key for key in (*keys, *own) if key not in features]
     if missing:

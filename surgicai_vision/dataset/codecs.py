@@ -66,9 +66,10 @@ def decode(content: Buffer | None, where: str) -> NDArray[np.uint8 | np.float32]
     """
     data = np.frombuffer(content or b"", np.uint8)
     try:
-        if len(data) and _pixels(content) > MOST_PIXELS:
+        pixels = _pixels(content)
+        if pixels > MOST_PIXELS:
             raise BadFile(f"{where}: its image has over {MOST_PIXELS} pixels.")
-        frame = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        frame = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if pixels else None
         if frame is None:
             raise BadFile(f"{where}: its image cannot be decoded.")
         if frame.ndim == 2:
@@ -83,7 +84,10 @@ def decode(content: Buffer | None, where: str) -> NDArray[np.uint8 | np.float32]
 
 
 def _pixels(content: Buffer | None) -> int:
-    """Return how many pixels an image's header claims; 0 if it cannot be read."""
+    """Return how many pixels an image's header claims; 0 if it cannot be read.
+
+    OpenCV decodes formats whose size is then not known, such as Radiance; no dataset has them.
+    """
     try:
         with Pillow.open(io.BytesIO(content or b"")) as image:
             return image.width * image.height

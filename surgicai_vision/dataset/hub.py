@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from surgicai_vision.core import names
+from surgicai_vision.core.config import digest
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output
@@ -121,6 +122,8 @@ def push_dataset(
 ) -> str:
     """Push a dataset of ours with its card, in one commit; return the commit's address.
 
+    A dataset that the repository held before is replaced.
+
     Args:
         path: the dataset.
         repo: "user/name"; created if it does not exist.
@@ -137,14 +140,23 @@ def push_dataset(
     dataset = open_dataset(path)
     api = connect(repo, api)
     _whole(check_dataset(path, progress), str(path))
-    from huggingface_hub import CommitOperationAdd
+    from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
     card = dataset_card(dataset, repo, licence)
     files = [file for name in KEPT for file in sorted((path / name).rglob("*")) if file.is_file()]
-    operations = [CommitOperationAdd(file.relative_to(path).as_posix(), file) for file in files]
+    pushed = {file.relative_to(path).as_posix(): file for file in files}
+    operations: list[CommitOperationAdd | CommitOperationDelete] = [
+        CommitOperationAdd(name, file) for name, file in pushed.items()
+    ]
     operations.append(CommitOperationAdd(CARD, io.BytesIO(card.encode())))
     with refusals_in_one_line(repo):
         api.create_repo(repo, repo_type="dataset", private=private, exist_ok=True)
+        # Files of an earlier, larger dataset would become a part of this one.
+        operations += [
+            CommitOperationDelete(name)
+            for name in api.list_repo_files(repo, repo_type="dataset")
+            if name.partition("/")[0] in KEPT and name not in pushed
+        ]
         text = f"{dataset.meta['episodes']} episodes of {dataset.task}"
         commit = api.create_commit(repo, operations, commit_message=text, repo_type="dataset")
         tags = api.list_repo_refs(repo, repo_type="dataset").tags
@@ -164,7 +176,7 @@ def pull_dataset(
 ) -> CheckReport:
     """Fetch a dataset of ours into the new folder `out` and check it.
 
-    A call after a failure continues with what was already fetched.
+    A call after a failure continues with what was already fetched, unless that was damaged.
 
     Raises:
         InputError: a bad name.
@@ -175,7 +187,8 @@ def pull_dataset(
     check_output(out)
     api = connect(repo, api)
     with building(out) as (store, result):
-        fetched = store / "fetched"
+        # A failed pull of another repository or revision may have left its files in the store.
+        fetched = store / f"fetched-{digest([repo, revision])[:12]}"
         with refusals_in_one_line(repo):
             wanted = [f"{name}/**" for name in KEPT]
             api.snapshot_download(
@@ -191,8 +204,12 @@ def pull_dataset(
                 f"{repo} is not a dataset of surgicai-vision; fetch it with 'hf download {repo} "
                 "--repo-type dataset' and check it with 'lerobot-salvage check DIR'."
             )
-        report = check_dataset(fetched, progress)
-        _whole(report, repo)
+        try:
+            report = check_dataset(fetched, progress)
+            _whole(report, repo)
+        except BadFile:  # the next pull must not continue with it
+            shutil.rmtree(fetched)
+            raise
         if out.exists():
             out.rmdir()  # empty, as checked above
         os.rename(fetched, result)

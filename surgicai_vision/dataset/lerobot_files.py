@@ -17,7 +17,7 @@ from typing import cast
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from surgicai_vision.core.errors import BadFile, first_line
+from surgicai_vision.core.errors import BadFile, first_line, shown
 from surgicai_vision.core.files import read_json
 from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset.metadata import INDEX_FEATURES, arrow_schema
@@ -182,7 +182,12 @@ class LeRobotFiles:
 
 
 def _feature(key: str, row: Table) -> Table:
-    """Return a feature with its shape as a tuple; refuse a shape or an `info` that cannot be."""
+    """Return a feature with its shape as a tuple; refuse a name, shape or `info` that cannot be.
+
+    A name is part of its videos' path: LeRobot allows no "/" in it, and "../x" would lead outside.
+    """
+    if "/" in key:
+        raise ValueError(f"the feature's name {shown(key)} contains a /")
     shape = tuple(int(side) for side in row["shape"])
     fits = 1 <= len(shape) <= MOST_AXES and min(shape) >= 1
     if not fits or math.prod(shape) > MOST_ELEMENTS:

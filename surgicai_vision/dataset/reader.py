@@ -104,7 +104,8 @@ class RenderedDataset:
             checked(self.meta["episodes"], int, f"{file}: episodes")
             for view in self.views:
                 checked(self.meta["cameras"][view], dict, f"{file}: cameras")
-            check_at_least(1, fps=self.fps, variants=self.variants, image_size=self.image_size)
+            check_at_least(1, frames=self.length, fps=self.fps, variants=self.variants)
+            check_at_least(1, image_size=self.image_size)
             check_at_most(schema.SIZES[1], image_size=self.image_size)
         except DAMAGED as error:
             raise BadFile(f"{file} is damaged ({error}).") from None

@@ -59,7 +59,7 @@ def with_frame_stride(dataset: Dataset, frame_stride: int) -> Dataset:
         InputError: `frame_stride` is not a multiple of the stride the dataset was rendered with.
     """
     check_at_least(1, frame_stride=frame_stride)
-    held = names.FPS // dataset.fps
+    held = _held(dataset)
     if frame_stride % held:
         raise InputError(
             f"The recipe uses a frame every {frame_stride} steps; the dataset holds one every "
@@ -73,6 +73,13 @@ def with_frame_stride(dataset: Dataset, frame_stride: int) -> Dataset:
     rows = np.flatnonzero(position % stride == 0)
     fps = max(dataset.fps // stride, 1)
     return DatasetSubset(dataset, rows, {"frame_stride": stride}, fps=fps)
+
+
+def _held(dataset: Dataset) -> int:
+    """Return the control steps from frame to frame; a subset's `fps` is rounded."""
+    if isinstance(dataset, DatasetSubset):
+        return _held(dataset.whole) * dataset.stride
+    return names.FPS // dataset.fps
 
 
 def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
@@ -159,6 +166,7 @@ class DatasetSubset:
         task: name of the task.
         fps: frames per second of simulated time, rounded down, at least 1.
         length: N.
+        stride: every how many frames of the whole it holds one.
     """
 
     def __init__(
@@ -194,6 +202,7 @@ class DatasetSubset:
         self.image_size = whole.image_size
         self.fps = fps or whole.fps
         self.length = len(rows)
+        self.stride = int(self._selection.get("frame_stride", 1))
 
     @functools.cached_property
     def fingerprint(self) -> str:

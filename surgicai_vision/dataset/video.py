@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.errors import BadFile, first_line
 from surgicai_vision.core.processes import kept_schedule
 from surgicai_vision.core.video import REPEATABLE
 
@@ -108,10 +108,8 @@ def read_frames(
                 wanted += 1
                 if wanted == first + count:
                     return
-    except (OSError, av.FFmpegError, IndexError, TypeError) as error:
-        raise BadFile(
-            f"{path}: frame {wanted} cannot be decoded ({str(error).splitlines()[0]})."
-        ) from None
+    except (OSError, av.FFmpegError, IndexError, TypeError, OverflowError) as error:
+        raise BadFile(f"{path}: frame {wanted} cannot be decoded ({first_line(error)}).") from None
     if wanted < first + count:
         raise BadFile(f"{path} has no frame {wanted}.")
 

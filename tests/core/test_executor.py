@@ -8,15 +8,19 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import fake_jobs
 import pytest
 from filelock import FileLock
 
-from surgicai_vision.core.errors import InputError, SurgicaiError, UnknownName
+from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, UnknownName
 from surgicai_vision.core.executor import (
+    ENGINES,
     JOBS,
+    Engine,
     Job,
     RunContext,
     building,
@@ -272,6 +276,37 @@ def test_engines_are_asked_for_in_words(monkeypatch):
     for name in ("ray", "slurm"):
         with pytest.raises(InputError, match=rf"pip install 'surgicai-vision\[{name}\]'"):
             open_engine(name)
+
+
+def test_an_error_of_another_distributions_engine_says_whose_it_is(monkeypatch):
+    @dataclass(frozen=True)
+    class Broken(Engine):
+        name: ClassVar[str] = "broken"
+        rooms: int = 1
+
+        def __post_init__(self) -> None:
+            raise RuntimeError("no licence")
+
+        def execute(self, tasks, workers, attempts=None):
+            yield from ()
+
+    ENGINES.register("broken", Broken, "theirs")
+    try:
+        with pytest.raises(InputError, match=r"The executor 'broken' of 'theirs' failed: .*licen"):
+            open_engine("broken,rooms=2")
+    finally:
+        ENGINES.unregister("broken")
+
+
+def test_a_folder_that_another_run_has_made_is_found_before_the_work(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    with building(out) as (_, result), whole_folder(result) as folder:  # an empty one is taken
+        (folder / "made").write_text("first")
+    with pytest.raises(OutputExists, match="run the command again"), building(out):
+        raise AssertionError
+    assert (out / "made").read_text() == "first"
+    assert not list(tmp_path.glob("*.work"))
 
 
 def test_slurm_is_looked_for_before_any_job(tmp_path, monkeypatch):

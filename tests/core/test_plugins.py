@@ -16,20 +16,21 @@ from surgicai_vision import (
     register_policy,
     register_task,
 )
+from surgicai_vision.core import cameras, names
 from surgicai_vision.core.errors import InputError, UnknownName
-from surgicai_vision.core.plugins import NameCollision, Registry, instance_of
+from surgicai_vision.core.plugins import CAMERAS_GROUP, NameCollision, Registry, instance_of
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.scene.cameras import CameraPose
 
 GROUP = "surgicai_vision.numbers"
 
 
-def install(folder: Path, name: str, points: str) -> None:
+def install(folder: Path, name: str, points: str, group: str = GROUP) -> None:
     """Write the metadata of an installed distribution, as pip does."""
     info = folder / f"{name}-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[{GROUP}]\n{points}\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{points}\n")
 
 
 @pytest.fixture
@@ -79,6 +80,18 @@ def test_a_collision_names_both_distributions(site: Path) -> None:
     for look_up in (registry.check, registry.load, registry.owner):
         with pytest.raises(NameCollision, match=r"'surgicai-vision'.*'their-numbers'"):
             look_up("pi")
+
+
+def test_a_camera_that_two_distributions_offer_is_in_no_scene(
+    site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours = dict.fromkeys(names.CAMERAS, "math:pi")
+    monkeypatch.setattr(cameras, "CAMERAS", Registry("camera", CAMERAS_GROUP, ours))
+    install(site, "their-cameras", "side = math:pi\nabove = math:pi", CAMERAS_GROUP)
+    install(site, "more-cameras", "side = math:pi", CAMERAS_GROUP)
+    assert cameras.other_cameras() == ("above",)
+    with pytest.raises(NameCollision, match=r"'side'.*-cameras'.*-cameras'"):
+        cameras.check_camera("side")
 
 
 @pytest.mark.parametrize(

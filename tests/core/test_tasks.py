@@ -103,6 +103,21 @@ def test_a_task_under_another_name_is_refused(monkeypatch: pytest.MonkeyPatch) -
         tasks.TASKS.unregister("elsewhere")
 
 
+def test_a_task_whose_name_is_no_id_breaks_only_itself() -> None:
+    wrong = type("Wrong", (Hover,), {"name": "hover near"})
+    with pytest.raises(InputError, match=r"'hover near' cannot have this name.*letters"):
+        surgicai_vision.register_task(wrong)
+    assert "hover near" not in tasks.task_names()
+    tasks.TASKS.register("hover near", wrong)  # as an entry point does
+    try:
+        tasks.register_ids()
+        assert gymnasium.spec(tasks.env_id("grasp"))
+        with pytest.raises(InputError, match=r"'hover near'.*cannot have this name"):
+            tasks.load_subtask("hover near")
+    finally:
+        tasks.TASKS.unregister("hover near")
+
+
 def test_a_task_that_fails_at_its_start_is_named(
     hover: type[Subtask], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,6 +5,7 @@ import os
 import shutil
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from fake_demos import render_with_fake_env, write_demos
@@ -158,6 +159,18 @@ def test_views_of_a_video_dataset(tmp_path, demos):
     )
     with pytest.raises(InputError, match="already holds videos"):
         convert_dataset(tmp_path / "video", tmp_path / "again", video="av1")
+
+
+def test_a_place_far_beyond_a_video_is_a_bad_file(tmp_path, demos):
+    render(demos, tmp_path / "video", video="h264")
+    file = tmp_path / "video/meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(file)
+    key = f"videos/{names.image_key('front')}/from_timestamp"
+    places = pa.array([1e30] * len(table))
+    pq.write_table(table.set_column(table.column_names.index(key), key, places), file)
+    with pytest.raises(BadFile, match="cannot be decoded"):
+        open_dataset(tmp_path / "video").frames("front")
+    assert not check_dataset(tmp_path / "video").ok
 
 
 def test_the_same_command_again_does_nothing_and_wrong_ones_are_refused(tmp_path, demos):

@@ -2,16 +2,19 @@
 
 import dataclasses
 import json
+import math
 import re
 import struct
 import subprocess
 import sys
 import zlib
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from fake_dataset import recorded as recorded_frames
 from fake_demos import write_demos
 from fake_env import FakeEnv
 from shown import showing
@@ -132,6 +135,13 @@ def test_every_fifth_frame_is_one_of_all(tmp_path, fake, demos, monkeypatch):
         render(demos, tmp_path / "none", frame_stride=4)
     with pytest.raises(InputError, match="a replay needs one for each step"):
         open_policy("replay", dataset=few)
+
+
+@pytest.mark.parametrize("stride", [3, 9, 60])
+def test_a_stride_that_the_frames_have_already_changes_nothing(stride):
+    dataset = with_frame_stride(recorded_frames(2, 130), stride)
+    assert with_frame_stride(dataset, stride) is dataset
+    assert with_frame_stride(dataset, 2 * stride).length == 2 * math.ceil(130 / (2 * stride))
 
 
 def test_frames_of_held_actions_are_that_many_control_steps_apart(tmp_path, fake):
@@ -406,7 +416,13 @@ def test_a_dataset_knows_how_late_its_demonstrators_noticed_a_loss(tmp_path, fak
     [
         *("no meta", "not json", "key gone", "short data", "data gone", "not parquet"),
         *({"image_size": 10**9}, {"image_size": 1e999}, {"fps": 0}, {"variants": 0}),
-        *({"cameras": {}}, {"cameras": {"front": 1}}, {"digest": None}, {"episodes": "1"}),
+        *(
+            {"frames": 0},
+            {"cameras": {}},
+            {"cameras": {"front": 1}},
+            {"digest": None},
+            {"episodes": "1"},
+        ),
     ],
     ids=str,
 )
@@ -423,6 +439,8 @@ def test_damaged_dataset_is_a_bad_file(tmp_path, fake, demos, spoil):
         meta.write_text("{")
     elif isinstance(spoil, dict):
         meta.write_text(json.dumps({**content, **spoil}))
+        if "frames" in spoil:
+            data.unlink()
     elif spoil == "key gone":
         del content["views"]
         meta.write_text(json.dumps(content))
@@ -557,6 +575,14 @@ def test_a_huge_image_is_refused_before_it_is_decoded(side, monkeypatch):
         codecs.decode(huge_png(side), "x")
 
 
+def test_an_image_whose_size_only_opencv_can_read_is_refused(monkeypatch):
+    image = np.full((8, 8, 3), 0.5, np.float32)
+    content = cv2.imencode(".hdr", image)[1].tobytes()
+    monkeypatch.setattr(codecs.cv2, "imdecode", None)
+    with pytest.raises(BadFile, match="x: its image cannot be decoded"):
+        codecs.decode(content, "x")
+
+
 BAD_STATISTICS = {
     "text": {"mean": "x"},
     "table": {"std": {"a": 1}},
@@ -598,6 +624,16 @@ def test_check_finds_damaged_metadata(tmp_path, fake, demos):
     assert (
         "meta/info.json: its counts differ from the data."
         in check_dataset(tmp_path / "set").problems
+    )
+    info.write_text(info.read_text().replace('"fps": 50', '"fps": 10'))
+    assert "meta/info.json: its fps is not 50." in check_dataset(tmp_path / "set").problems
+    tasks = tmp_path / "set/meta/tasks.parquet"
+    pq.write_table(pq.read_table(tasks).slice(1), tasks)
+    assert "meta/tasks.parquet: it holds no task." in check_dataset(tmp_path / "set").problems
+    tasks.unlink()
+    assert any(
+        "LeRobot's metadata cannot be read" in line
+        for line in check_dataset(tmp_path / "set").problems
     )
     (tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").write_bytes(b"")
     assert any(

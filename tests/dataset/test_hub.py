@@ -54,6 +54,32 @@ def test_what_is_pushed_is_what_is_pulled(tmp_path, dataset, fake_hub):
     assert fake_hub.tags == {"v3.0": "commit5"}
 
 
+def test_a_push_replaces_the_dataset_that_was_there(tmp_path, dataset, fake_hub):
+    for name in ("data/chunk-000/file-001.parquet", "notes/kept.txt"):
+        (fake_hub.folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (fake_hub.folder / name).write_text("of a larger one")
+    push_dataset(dataset, REPO, api=fake_hub)
+    assert (fake_hub.folder / "notes/kept.txt").exists()
+    assert pull_dataset(REPO, tmp_path / "pulled", api=fake_hub).ok
+
+
+@pytest.mark.parametrize("broken", [True, False], ids=["damaged", "interrupted"])
+def test_a_pull_begins_with_nothing_of_another_or_a_damaged_one(
+    tmp_path, dataset, fake_hub, monkeypatch, broken
+):
+    push_dataset(dataset, REPO, api=fake_hub)
+    extra = fake_hub.folder / "data/chunk-000/file-001.parquet"
+    extra.write_bytes((fake_hub.folder / "data/chunk-000/file-000.parquet").read_bytes())
+    with monkeypatch.context() as patch:
+        if not broken:
+            patch.setattr("surgicai_vision.dataset.hub.check_dataset", lambda *_: 1 / 0)
+        with pytest.raises(BadFile if broken else ZeroDivisionError):
+            pull_dataset(REPO, tmp_path / "pulled", api=fake_hub)
+    extra.unlink()
+    repo = REPO if broken else "somebody/else"
+    assert pull_dataset(repo, tmp_path / "pulled", api=fake_hub).ok
+
+
 def test_the_card_says_what_it_is(dataset):
     card = dataset_card(open_dataset(dataset), REPO, "cc-by-4.0")
     _, header, body = card.split("---\n", 2)

@@ -194,6 +194,14 @@ def test_env_without_a_dataset_has_its_tasks_own_limit() -> None:
     assert SurgicaiEnv(task="place").max_steps == SurgicaiEnv().max_steps == 200
 
 
+def test_env_of_another_task_than_the_datasets_has_that_tasks_limit(dataset: Path) -> None:
+    from lerobot_env_surgicai import SurgicaiEnv
+
+    assert SurgicaiEnv(dataset=str(dataset), task="suture").max_steps == 1000
+    assert SurgicaiEnv(dataset=str(dataset), task="suture", max_steps=9).max_steps == 9
+    assert SurgicaiEnv(dataset=str(dataset), tasks=["suture", TASK]).max_steps == 1000
+
+
 def test_env_shows_what_the_dataset_holds_and_waits_after_its_end(dataset: Path) -> None:
     from lerobot.envs.factory import make_env, make_env_config
     from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation

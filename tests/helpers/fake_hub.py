@@ -4,6 +4,8 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+from huggingface_hub import CommitOperationDelete
+
 
 class FakeHub:
     """Keeps commits in a folder and records its calls."""
@@ -18,12 +20,19 @@ class FakeHub:
 
     def create_commit(self, repo, operations, *, commit_message, repo_type):
         for operation in operations:
+            if isinstance(operation, CommitOperationDelete):
+                (self.folder / operation.path_in_repo).unlink()
+                continue
             target = self.folder / operation.path_in_repo
             target.parent.mkdir(parents=True, exist_ok=True)
             with operation.as_file() as content:
                 target.write_bytes(content.read())
         self.asked.append(("create_commit", repo, commit_message, repo_type))
         return SimpleNamespace(oid=f"commit{len(self.asked)}", commit_url=f"https://hub/{repo}")
+
+    def list_repo_files(self, repo, *, repo_type):
+        files = (path for path in self.folder.rglob("*") if path.is_file())
+        return [path.relative_to(self.folder).as_posix() for path in files]
 
     def list_repo_refs(self, repo, *, repo_type):
         return SimpleNamespace(tags=[SimpleNamespace(name=name) for name in self.tags])

@@ -292,6 +292,29 @@ def test_a_feature_that_cannot_be_is_refused(tmp_path, foreign, changes, said):
             work(folder)
 
 
+@pytest.mark.parametrize("key", ["../../outside", "observation.images.a/b"])
+def test_a_feature_whose_name_is_a_path_is_refused(tmp_path, foreign, key):
+    folder = shutil.copytree(foreign / "killed", tmp_path / "set")
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["features"][key] = {**info["features"][CAMERA], "dtype": "video"}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    for work in (check_dataset, repair_dataset):
+        with pytest.raises(BadFile, match=f"the feature's name '{key}' contains a /"):
+            work(folder)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("from_timestamp", float("inf")), ("chunk_index", None)]
+)
+def test_a_place_in_the_videos_that_is_no_number_ends_the_prefix(tmp_path, column, value):
+    write_lerobot(tmp_path / "set", video=True).finalize()
+    rows = next(tmp_path.glob("set/meta/episodes/*/*.parquet"))
+    change(rows, f"videos/{CAMERA}/{column}", 1, value)
+    problems = check_dataset(tmp_path / "set").problems
+    assert f"episode 1: its place in the videos of {CAMERA} is not numbers." in problems
+    assert repair_dataset(tmp_path / "set").episodes == 1
+
+
 def test_large_images_and_an_empty_info_are_allowed(tmp_path, foreign):
     folder = shutil.copytree(foreign / "killed", tmp_path / "set")
     describe(folder, CAMERA, shape=[2160, 3840, 3], info=None)
@@ -351,10 +374,26 @@ def test_nothing_whole_is_one_line_and_changes_nothing(tmp_path, foreign):
     assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == ["set"]
     with pytest.raises(BadFile, match="which nothing can be read"):
         repair_dataset(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "empty")
+    with pytest.raises(InputError, match="a link or a mount point"):
+        repair_dataset(folder, tmp_path / "link")
     (tmp_path / "full").mkdir()
     (tmp_path / "full/note").write_text("mine")
     with pytest.raises(OutputExists):
         repair_dataset(folder, tmp_path / "full")
+
+
+@pytest.mark.parametrize("name", [".", ".."])
+def test_the_current_folder_is_repaired_only_into_another(
+    tmp_path, foreign, monkeypatch, name, capsys
+):
+    folder = shutil.copytree(foreign / "killed", tmp_path / "set")
+    (folder / "below").mkdir()
+    monkeypatch.chdir(folder if name == "." else folder / "below")
+    assert main(["repair", name]) == 2
+    assert "give --out DIR" in capsys.readouterr().err
+    assert main(["repair", name, "--out", str(tmp_path / "mended")]) == 0
 
 
 def test_a_second_repair_is_refused_and_leaves_the_first_ones_work(tmp_path, foreign):

@@ -43,10 +43,13 @@ def open_engine(text: str) -> Engine:
 
     Raises:
         UnknownName: an engine or an option that does not exist.
-        InputError: a value that is not allowed, or a package that is missing.
+        InputError: a value that is not allowed, a package that is missing, or an error of another
+            distribution's engine.
     """
     name, *options = text.split(",")
     engine = ENGINES.load(name)
     if options and not dataclasses.fields(engine):
         raise InputError(f"--executor {name} takes no options; leave '{options[0]}' out.")
-    return from_mapping(engine, read_changes(options), f"--executor {name}")
+    changes = read_changes(options)
+    with ENGINES.calling(name):
+        return from_mapping(engine, changes, f"--executor {name}")

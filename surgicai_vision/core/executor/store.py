@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.executor.context import RunContext
 from surgicai_vision.core.executor.jobs import Job, Task
 from surgicai_vision.core.files import TEMPORARY, check_renamed, locked, sync_folder
@@ -115,11 +115,14 @@ def building(out: Path) -> Iterator[tuple[Path, Path]]:
 
     Raises:
         InputError: nothing can be renamed to `out` (`files.check_renamed`).
+        OutputExists: another run has made `out` since the caller looked.
     """
     check_renamed(out)
     store = work_folder(out)
     try:
         with claim(store):
+            if out.exists() and any(out.iterdir()):
+                raise OutputExists(f"Another run has made {out} meanwhile; run the command again.")
             result = store / "result"
             shutil.rmtree(result, ignore_errors=True)
             yield store, result
