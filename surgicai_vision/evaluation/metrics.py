@@ -18,6 +18,16 @@ from surgicai_vision.evaluation.statistics import clopper_pearson, mean_and_std
 if TYPE_CHECKING:
     from surgicai_vision.envs.visits import Visit
 
+AFTER_THE_START = (
+    "slip_mm",
+    "slip_deg",
+    "tissue_force_n",
+    "tissue_impulse_ns",
+    "tears",
+    "thread_mm",
+)
+"""Columns of largest values and sums, which are NaN where the start could not be made."""
+
 KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
 """Kinds of failure, see `failure_kind`, in the order in which charts stack them."""
 
@@ -156,7 +166,7 @@ def summary(rows: Sequence[EpisodeMetrics]) -> dict[str, Any]:
         "ci95": list(clopper_pearson(len(successes), len(rows))),
         "paper_successes": sum(row.paper_success for row in rows),
         **{key: mean_and_std(_finite(successes, column)) for key, column in ON_SUCCESSES},
-        **{column: _spread(_finite(rows, column)) for column in MEASURED},
+        **{column: _spread(_finite(_having(rows, column), column)) for column in MEASURED},
         "grasp": first.grasp,
         "errors": sum(1 for row in rows if row.error),
         "failures": {kind: failures.count(kind) for kind in KINDS if kind in failures},
@@ -220,6 +230,21 @@ def _reached(rows: Sequence[EpisodeMetrics]) -> dict[str, int]:
         subtask: sum(row.stages > index for row in rows)
         for index, subtask in enumerate(names.SUBTASKS)
     }
+
+
+def is_measured(failure: str, column: str) -> bool:
+    """Return True unless nothing could be measured: a needle never held has no slip, not 0 mm.
+
+    Args:
+        failure: of the episode, "" for a success.
+        column: a field of `EpisodeMetrics`.
+    """
+    return not (column.startswith("slip") and failure == "missed")
+
+
+def _having(rows: Sequence[EpisodeMetrics], column: str) -> list[EpisodeMetrics]:
+    """Return the episodes in which a column could be measured."""
+    return [row for row in rows if is_measured(row.failure, column)]
 
 
 def _finite(rows: Sequence[EpisodeMetrics], column: str) -> list[float]:

@@ -9,7 +9,7 @@ open_policy("my_package.my_module:factory")  # a function that returns an `agent
 """
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -225,6 +225,7 @@ def in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
     if "task" in env:
         raise InputError("env: the task is a separate option; write `task:` next to `env:`.")
     limit: dict[str, JSON] = {}
+    make: Callable[..., Agent] = spec.make
     if spec.run.is_hierarchical:
         if "advance" in env:
             raise InputError(
@@ -232,7 +233,10 @@ def in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
             )
         limit = {"max_steps": spec.config.max_steps, "advance": spec.config.advance}
     config = from_mapping(TaskConfig, {**limit, **env, "task": spec.config.task}, "env")
-    return replace(spec, run=evaluated_in(spec.run, config))
+    if spec.run.is_hierarchical:
+        # It counts the control steps of a subtask.
+        make = functools.partial(make, action_repeat=config.action_repeat)
+    return replace(spec, run=evaluated_in(spec.run, config), make=make)
 
 
 def _replay(dataset: "Dataset") -> PolicySpec:
@@ -487,7 +491,7 @@ def hierarchical_policy(
         expert_swap=expert_swap,
     )
     make = functools.partial(
-        HierarchicalAgent, config, tuple(agents.values()), high, env.action_repeat
+        HierarchicalAgent, config, tuple(agents.values()), high, action_repeat=env.action_repeat
     )
     return PolicySpec(run, make, about)
 

@@ -295,7 +295,9 @@ def area_under_curve(strength: ArrayLike, success: ArrayLike) -> float:
             f"Strengths {x.tolist()} with {y.size} successes; "
             "give at least two, increasing, one success for each."
         )
-    return float(np.sum(np.diff(x) * (y[1:] + y[:-1])) / 2 / (x[-1] - x[0]))
+    area = float(np.sum(np.diff(x) * (y[1:] + y[:-1])) / 2 / (x[-1] - x[0]))
+    # A mean, which rounding must not take out of the range of what it is a mean of.
+    return min(max(area, float(y.min())), float(y.max()))
 
 
 def area_interval(areas: Sequence[float], level: float = 0.95) -> tuple[float, float]:

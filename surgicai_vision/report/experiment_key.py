@@ -3,14 +3,15 @@
 import itertools
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from surgicai_vision.core.banks import HELD_OUT
 from surgicai_vision.core.cameras import view_names
-from surgicai_vision.core.config import TaskConfig, read_changes, world_text
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig, read_changes, world_text
 from surgicai_vision.core.tasks import task_names
+from surgicai_vision.evaluation.robustness.axes import AXES, shifted_config
 from surgicai_vision.rl.algorithms import ALGORITHMS
-from surgicai_vision.training.run_config import BUDGET, RunConfig
+from surgicai_vision.training.run_config import BUDGET, RunConfig, Shift
 
 USUAL = "the usual world"
 """The name of a world in which nothing varies."""
@@ -114,11 +115,19 @@ class Condition:
             *dict.fromkeys(part for part, common in usual if part != common),
             " + ".join(self.changes),
             f"acting by {' + '.join(self.acted_by)}" if self.acted_by else "",
+            *self.amounts,
+            *self.surroundings,
+            self.place,
+        )
+        return tuple(part for part in parts if part)
+
+    @property
+    def amounts(self) -> tuple[str, ...]:
+        """Everything unusual about how much it learned from, demonstrations aside."""
+        parts = (
             self.looks,
             f"multiplied from {self.multiplied_from}" if self.multiplied_from else "",
             f"rounds of DAgger: {self.dagger_rounds}" if self.dagger_rounds else "",
-            *self.surroundings,
-            self.place,
         )
         return tuple(part for part in parts if part)
 
@@ -248,17 +257,32 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
 
 
 def _worlds(run: RunConfig) -> dict[str, str]:
-    """Return a condition's `world` and `recorded_in`; a shift is added to the world it learned in.
-
-    An evaluation by an earlier version may not say what a shift was added to.
-    """
+    """Return a condition's `world` and `recorded_in`, each of them before a shift."""
+    world = world_text(_unshifted(run, run.shift) if run.shift else run.env)
     learned = world_text(run.recorded_in) if run.recorded_in else ""
-    if run.shift:
-        return {"world": learned}
-    return {
-        "world": world_text(run.env),
-        "recorded_in": (learned or USUAL) if run.recorded_in and not run.is_hierarchical else "",
-    }
+    is_away = run.recorded_in and not run.is_hierarchical and not (run.shift and learned == world)
+    return {"world": world, "recorded_in": (learned or USUAL) if is_away else ""}
+
+
+def _unshifted(run: RunConfig, shift: Shift) -> TaskConfig:
+    """Return the env that a shift was added to: where the policy learned, or else without it.
+
+    What a shift was added to is not known where both together exceeded a limit.
+    """
+    env = run.env
+    axis = AXES.get(shift.axis)
+    if axis is None:
+        return env
+    if run.recorded_in:
+        learned = replace(env, randomisation=run.recorded_in.randomisation)
+        # The env of a run that is only planned is not shifted yet.
+        if env in (learned, shifted_config(learned, axis, shift.strength)):
+            return learned
+    alone = asdict(shifted_config(TaskConfig(run.task), axis, shift.strength).randomisation)
+    table = asdict(env.randomisation)
+    for name in axis.world:
+        table[name] = max(0, round(table[name] - alone[name], 9))
+    return replace(env, randomisation=RandomisationConfig(**table))
 
 
 def _budget(run: RunConfig) -> str:

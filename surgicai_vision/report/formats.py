@@ -47,7 +47,7 @@ _LATEX = {
 
 def markdown(groups: Sequence[Group], title: str) -> str:
     """Return the tables as Markdown."""
-    parts = [f"# {_escaped(title)}", ""]
+    parts = [f"# {escape_markdown(title)}", ""]
     rows = beside_paper(groups)
     if rows:
         parts += [
@@ -135,7 +135,7 @@ def _paired(
         yield our_text(item)
 
 
-def _escaped(words: str) -> str:
+def escape_markdown(words: str) -> str:
     """Return one line that Markdown reads as plain text in a table."""
     return re.sub(r"([|\\*_`<\[])", r"\\\1", " ".join(words.split()))
 
@@ -143,7 +143,7 @@ def _escaped(words: str) -> str:
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     lines = [head, ["---"] * len(head)]
     shown = ["| " + " | ".join(line) + " |" for line in lines]
-    return [*shown, *("| " + " | ".join(map(_escaped, row)) + " |" for row in rows), ""]
+    return [*shown, *("| " + " | ".join(map(escape_markdown, row)) + " |" for row in rows), ""]
 
 
 def _latex_row(row: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from surgicai_vision.core import percentages
 from surgicai_vision.evaluation import statistics
-from surgicai_vision.evaluation.metrics import KINDS
+from surgicai_vision.evaluation.metrics import KINDS, is_measured
 from surgicai_vision.report import text
 from surgicai_vision.report.experiment_key import Condition, distinctions, order
 from surgicai_vision.report.reader import Collected, Missing, Result
@@ -141,12 +141,8 @@ class Group:
 
 
 def measured(row: Mapping[str, Any], column: str) -> float | None:
-    """Return a value of an episode.
-
-    A needle that was never held has no slip, rather than one of 0 mm.
-    """
-    absent = column.startswith("slip") and row["failure"] == "missed"
-    return None if absent else row.get(column)
+    """Return a value of an episode; None if it could not be measured."""
+    return row.get(column) if is_measured(row["failure"], column) else None
 
 
 def group(collected: Collected) -> list[Group]:

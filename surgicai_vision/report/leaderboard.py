@@ -158,7 +158,7 @@ def make_row(folder: Path, entry: Entry) -> Row:
         str(about.get("scene_hash", "")),
         str(checkpoint.get("policy_sha256") or ""),
         str(about.get("command", "")),
-        dict((about.get("provenance") or {}).get("packages", {})),
+        dict((about.get("provenance") or {}).get("packages") or {}),
         tuple(int(each["seed"]) for each in rows),
         tuple(bool(each["success"]) for each in rows),
         tuple(int(each["steps"]) for each in rows),

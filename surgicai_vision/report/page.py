@@ -140,7 +140,9 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
 
     The best of many is chosen after the fact, and the page says so.
     """
-    best = [found for task in tasks if (found := best_trained(of_task(evaluated, task)))]
+    best = [
+        found for task in tasks if (found := best_trained(of_task(evaluated, task, plain=False)))
+    ]
     if not best:
         return {
             "headline": f"References on {plural(len(tasks), 'task')}",
@@ -165,11 +167,9 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
     warning = (
         "Each is the best of several and was chosen after the fact, so its interval is optimistic."
     )
+    whose = f"each of {len(best)} tasks" if len(best) > 1 else best[0].condition.task
     return {
-        "headline": (
-            f"The best trained policy of each of {len(best)} tasks solves {span} of its"
-            f" {starts_of(best)}"
-        ),
+        "headline": f"The best trained policy of {whose} solves {span} of its {starts_of(best)}",
         "lead": f"{'; '.join(parts)}. {warning}",
     }
 

@@ -121,6 +121,8 @@ def factor(first: Condition, second: Condition) -> str:
     if len(differ) != 1:
         return ""
     (name,) = differ
+    if name == "encoder" and first.hierarchical and second.hierarchical:
+        return FACTORS["hierarchical"]  # there it is the name of the whole policy
     return "images" if name == "encoder" and any(are_blind) else FACTORS[name]
 
 

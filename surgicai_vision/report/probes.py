@@ -1,7 +1,7 @@
 """Probing: each encoder's linear probe next to the success of the policies that use it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Point, Series
 from surgicai_vision.report.curves import MOST, Chart
+from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.groups import Group
 
 FEWEST = 4
@@ -65,7 +66,10 @@ class Probes:
 
 
 def probes(found: Sequence[Mapping[str, Any]], groups: Sequence[Group]) -> Probes | None:
-    """Pair each probe with the success of the policies with its encoder, view, pool and task."""
+    """Pair each probe with the success of the policies with its encoder, view, pool and task.
+
+    Only held-out starts count.
+    """
     if not found:
         return None
     rows = tuple(_row(probe, [item for item in groups if _matches(probe, item)]) for probe in found)
@@ -75,8 +79,8 @@ def probes(found: Sequence[Mapping[str, Any]], groups: Sequence[Group]) -> Probe
 
 def _row(probe: Mapping[str, Any], mine: Sequence[Group]) -> ProbeRow:
     """Return one probe with the pooled success of its policies."""
-    k = sum(item.successes for item in mine)
-    n = sum(item.episodes for item in mine)
+    won = _wins(mine)
+    k, n = sum(won.values()), len(won)
     tip, angle = (text.finite([probe.get(name)]) for name in ("tip_mm", "angle_deg"))
     encoder = str(probe.get("encoder"))
     view = _view(probe)
@@ -101,9 +105,22 @@ def _row(probe: Mapping[str, Any], mine: Sequence[Group]) -> ProbeRow:
     )
 
 
+def _wins(groups: Sequence[Group]) -> dict[tuple[Condition, int, int], bool]:
+    """Return the success of each condition, training seed and start.
+
+    A policy that was evaluated twice on a start counts once, with the later one in the table.
+    """
+    return {
+        (replace(item.condition, place=""), result.seed, int(row["seed"])): bool(row["success"])
+        for item in groups
+        for result in item.results
+        for row in result.rows
+    }
+
+
 def _matches(probe: Mapping[str, Any], item: Group) -> bool:
     condition = item.condition
-    if not (item.episodes and condition.trained and condition.plain):
+    if not (item.episodes and condition.trained and condition.plain and condition.is_held_out):
         return False
     if probe.get("task") and probe["task"] != condition.task:
         return False

@@ -102,7 +102,7 @@ def _distinct(values: Iterable[object], joint: str = ", ") -> str:
 
 def _versions(made: dict[str, Any]) -> str:
     return ", ".join(
-        f"{name} {number}" for name, number in made.get("packages", {}).items() if number
+        f"{name} {number}" for name, number in (made.get("packages") or {}).items() if number
     )
 
 

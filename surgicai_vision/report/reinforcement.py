@@ -25,6 +25,7 @@ from surgicai_vision.report import aggregates, charts, paper, text
 from surgicai_vision.report.charts import Point, Series
 from surgicai_vision.report.curves import MOST, Chart
 from surgicai_vision.report.experiment_key import Condition, distinctions
+from surgicai_vision.report.formats import escape_markdown
 from surgicai_vision.report.groups import Group, starts_of
 from surgicai_vision.report.reader import Result
 from surgicai_vision.rl.algorithms import ALGORITHMS
@@ -154,7 +155,7 @@ def _settings(conditions: Collection[Condition]) -> dict[Condition, tuple[str, .
         words = list(key.changes)
         words += [key.encoder] if key.encoder != "relative" else []
         words += [f"{key.demonstrations} demonstrations"] if key.demonstrations else []
-        words += [*key.surroundings, details[without_count[key]]]
+        words += [*key.amounts, *key.surroundings, details[without_count[key]]]
         found[key] = tuple(filter(None, words))
     return found
 
@@ -323,5 +324,5 @@ def markdown(found: Learned) -> str:
 
 def _rows(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return a Markdown table and an empty line."""
-    lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
+    lines = [f"| {' | '.join(map(escape_markdown, row))} |" for row in (head, *rows)]
     return [lines[0], "|" + "---|" * len(head), *lines[1:], ""]

@@ -20,6 +20,8 @@ KINDS: Final = {".mp4": "video/mp4", ".jpg": "image/jpeg"}
 def opening_video(folder: Path, page: Path, run: Mapping[str, Any]) -> dict[str, str] | None:
     """Return what the template shows of a run's video; None if there is none.
 
+    There is none either if a file is outside the results folder, or neither an MP4 nor a JPEG.
+
     Args:
         folder: the results.
         page: where the page is written.
@@ -28,8 +30,17 @@ def opening_video(folder: Path, page: Path, run: Mapping[str, Any]) -> dict[str,
     told = run.get("video")
     if not told or not told.keys() >= PARTS or not (folder / told["file"]).is_file():
         return None
+    if not all(_is_shown(folder, told[key]) for key in ("file", "poster", "strip")):
+        return None
     files = {key: _address(folder / told[key], page) for key in ("file", "poster", "strip")}
     return {**files, "title": told["title"], "text": told["text"]}
+
+
+def _is_shown(folder: Path, name: str) -> bool:
+    """Return True for a file inside the folder that a page can show, or that is not there."""
+    path = (folder / name).resolve()
+    inside = path.is_relative_to(folder.resolve())
+    return inside and (path.suffix in KINDS or not path.is_file())
 
 
 def _address(path: Path, page: Path) -> str:

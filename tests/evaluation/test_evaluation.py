@@ -22,6 +22,7 @@ from surgicai_vision.evaluation import policy_spec, slot, storage
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent, RandomAgent, ZeroAgent
 from surgicai_vision.evaluation.metrics import (
+    AFTER_THE_START,
     KINDS,
     EpisodeMetrics,
     as_table,
@@ -233,13 +234,13 @@ def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
     assert rows[40].tissue_force_n == pytest.approx(1.2)
     assert rows[40].tissue_impulse_ns == pytest.approx(0.24)
     assert (rows[3].paper_success, rows[40].paper_success) == (True, False)
-    # An episode that could not start has no values of the episode before.
-    assert np.isnan([rows[97].entry_mm, rows[3].exit_mm]).all() and rows[97].slip_mm == 0.0
+    # An episode that could not start has no values, nor those of the episode before.
+    assert np.isnan([rows[97].entry_mm, rows[3].exit_mm, rows[97].slip_mm]).all()
     result = storage.write_evaluation(tmp_path, episodes, RunConfig(policy="zero"), {})
     half, zero = pytest.approx(0.5), pytest.approx(0.0)
     assert result["entry_mm"] == {"mean": half, "std": zero, "median": half, "n": 2}
     assert result["exit_mm"] == NEVER_MEASURED
-    assert result["tissue_force_n"]["n"] == 3
+    assert result["tissue_force_n"]["n"] == 2
     assert result["paper_successes"] == 1
     assert result["tears"] == result["thread_mm"] == NEVER_MEASURED
     assert json.loads((tmp_path / storage.MARKER).read_text())["summary"] == result
@@ -306,6 +307,19 @@ def test_what_was_measured_has_a_median_over_the_episodes_that_have_it():
     entry = summary(rows)["entry_mm"]
     assert (entry["mean"], entry["median"], entry["n"]) == (pytest.approx(1.4), 0.7, 3)
     assert summary(rows)["exit_mm"] == NEVER_MEASURED
+
+
+def test_a_needle_that_was_never_held_has_no_slip():
+    rows = [
+        replace(row_with_stages(0, 5), slip_mm=0.4),
+        replace(row_with_stages(1, 0), success=False, failure="missed"),
+    ]
+    assert summary(rows)["slip_mm"] == {"mean": 0.4, "std": None, "median": 0.4, "n": 1}
+
+
+def test_nothing_was_measured_where_the_start_could_not_be_made(fake_envs):
+    (row,) = [made.row for made in evaluate(ZeroAgent, SHORT, [97], batch=1)]
+    assert row.error and all(math.isnan(getattr(row, name)) for name in AFTER_THE_START)
 
 
 def test_the_line_about_an_evaluation_ends_with_the_medians_of_its_stitches():

@@ -294,6 +294,16 @@ def written(folder: Path, hlp: str, low: dict[str, str]) -> Path:
     return path
 
 
+def test_a_hierarchical_policy_counts_the_control_steps_of_the_env_it_is_given(
+    tmp_path: Path,
+) -> None:
+    path = written(tmp_path, "order", dict.fromkeys(EXPERTS, "zero"))
+    path.write_text(path.read_text() + "termination: privileged\n")
+    for held in (1, 5):
+        spec = open_policy(path, env={"action_repeat": held})
+        assert spec.config.action_repeat == spec.make()._action_repeat == held
+
+
 def test_a_counted_high_level_policy_is_told_with_its_errors(tmp_path: Path) -> None:
     folder = Path(checkpoint(tmp_path / "hlp", "suture", "hlp"))
     config = HierarchicalConfig(str(folder), **EXPERTS)

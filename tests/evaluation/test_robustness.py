@@ -303,6 +303,15 @@ def test_running_again_does_only_what_is_missing(tmp_path, pretend):
         curves.robustness(seeing_spec(), range(5), tmp_path, silent, ("light",))
 
 
+def test_what_a_kill_left_beside_the_plain_evaluation_is_not_copied(tmp_path, pretend):
+    seeds = range(900_000, 900_003)
+    curves.robustness(seeing_spec(), seeds, tmp_path, silent, ("light",), (0.0, 1.0))
+    (tmp_path / "light" / "0" / "finished").mkdir()
+    curves.robustness(seeing_spec(), seeds, tmp_path, silent, ("light", "blur"), (0.0, 1.0))
+    assert not (tmp_path / "blur" / "0" / "finished").exists()
+    assert repr(read_rows(tmp_path / "blur" / "0")) == repr(read_rows(tmp_path / "light" / "0"))
+
+
 @pytest.mark.parametrize("key", ["checkpoint", "dataset", "parts"])
 def test_curves_of_what_was_made_anew_are_not_taken_for_its_own(tmp_path, pretend, key):
     for made in ("first", "first", "second"):

@@ -130,6 +130,12 @@ def test_area_refuses_what_is_no_curve(strength, success):
         area_under_curve(strength, success)
 
 
+def test_an_area_stays_within_its_successes_where_its_strengths_round():
+    area = area_under_curve([0.0, 0.3, 0.9], [1.0, 1.0, 1.0])
+    assert area == 1.0  # the trapezoids' own sum is 1.0000000000000002
+    assert area_interval([area] * 4)[1] == 1.0
+
+
 def test_bootstrap_of_one_seed_is_the_exact_interval():
     values = [1.0] * 7 + [0.0] * 13
     assert hierarchical_bootstrap([values], np.random.default_rng(0)) == clopper_pearson(7, 20)

@@ -210,6 +210,24 @@ def test_other_worlds_starts_and_budgets_are_rows_of_their_own(tmp_path):
     }
 
 
+def test_multiplied_demonstrations_are_a_row_of_their_own_that_markdown_can_show(tmp_path):
+    generator = np.random.default_rng(0)
+    plain = run_of("td3-her-bc", "grasp", 0)
+    for name, run in {
+        "plain": plain,
+        "multiplied": replace(plain, multiplied_from=10),
+        "named": replace(plain, condition="a|b"),
+    }.items():
+        evaluation(tmp_path / name, run, 0.5, generator)
+    found = learned(group(collect(tmp_path)))
+    assert {row[0] for row in found.rows} == {
+        "td3-her-bc",
+        "td3-her-bc, multiplied from 10",
+        "td3-her-bc, a|b",
+    }
+    assert "| td3-her-bc, a\\|b |" in markdown(found)
+
+
 def test_validation_starts_are_not_called_held_out(tmp_path):
     cloned = RunConfig(TaskConfig("grasp"), privileged=True, demonstrations=100)
     for name, run in (("actor", run_of("td3-her-bc", "grasp", 0)), ("cloned", cloned)):

@@ -19,11 +19,13 @@ from surgicai_vision.evaluation.metrics import EpisodeMetrics
 from surgicai_vision.evaluation.slot import Episode, Film
 from surgicai_vision.evaluation.storage import (
     FORMAT,
+    MARKER,
     find_evaluations,
     read_film,
     read_rows,
     write_evaluation,
 )
+from surgicai_vision.report.video import opening_video
 from surgicai_vision.training.run_config import RunConfig, Starts
 
 LIMIT = 3_000_000
@@ -322,3 +324,24 @@ def test_depth_and_parts_are_coloured():
     assert far[2] > far[0], "far is blue"
     parts = np.full((4, 4, 1), names.PARTS.index("needle"), np.uint8)
     assert (contact_sheet.coloured(parts, "segmentation") == contact_sheet.PALETTE[2]).all()
+
+
+@pytest.mark.parametrize("poster", ["../outside.jpg", "film.webm"])
+def test_a_page_opens_with_files_of_its_folder_alone(tmp_path, poster):
+    folder = tmp_path / "results"
+    folder.mkdir()
+    for path in (folder / "film.mp4", folder / "film.webm", tmp_path / "outside.jpg"):
+        path.write_bytes(b"content")
+    told = {"file": "film.mp4", "poster": "none.jpg", "strip": "", "title": "t", "text": "t"}
+    page = folder / report.PAGE_FILE
+    assert opening_video(folder, page, {"video": told})["poster"] == ""
+    assert opening_video(folder, page, {"video": {**told, "poster": poster}}) is None
+
+
+def test_an_evaluation_that_names_no_packages_has_a_page(tmp_path, painted):
+    store(tmp_path, "zero", 3)
+    path = tmp_path / "evaluations" / "zero" / MARKER
+    stored = json.loads(path.read_text())
+    stored["about"]["provenance"] = {"packages": None}
+    files.write_json(path, stored)
+    assert "3/20" in report.write_report(tmp_path, strips=0).read_text()

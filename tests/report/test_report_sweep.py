@@ -23,6 +23,7 @@ from sweep_results import (
     STAGE_ERRORS,
     TASKS,
     add_curves,
+    episode,
     evaluation,
     run_of,
     store_run,
@@ -42,7 +43,8 @@ from surgicai_vision.core.config import (
 )
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation import statistics
-from surgicai_vision.evaluation.storage import FORMAT
+from surgicai_vision.evaluation.robustness.axes import AXES, shifted_config
+from surgicai_vision.evaluation.storage import FORMAT, write_evaluation
 from surgicai_vision.experiments.sweep.grid import Grid
 from surgicai_vision.experiments.sweep.plan import RunState
 from surgicai_vision.report import (
@@ -50,8 +52,10 @@ from surgicai_vision.report import (
     curves,
     filmstrips,
     formats,
+    page,
     paper,
     paper_comparison,
+    probes,
     tables,
 )
 from surgicai_vision.report.experiment_key import Condition, condition_of, order
@@ -60,7 +64,7 @@ from surgicai_vision.report.groups import best_trained, group, of_task
 from surgicai_vision.report.pairs import compare, factor
 from surgicai_vision.report.reader import collect
 from surgicai_vision.report.sections import heat_maps
-from surgicai_vision.training.run_config import RunConfig, Shift, evaluated_in
+from surgicai_vision.training.run_config import RunConfig, Shift, Starts, evaluated_in
 
 LIMIT = 8_000_000
 EXPERT = RunConfig(TaskConfig("grasp"), policy="expert")
@@ -570,6 +574,64 @@ def test_shifted_evaluations_alone_make_a_page(tmp_path, monkeypatch):
     assert "random on front, blur 0 solves 20 of 20 held-out starts of grasp" in text
     assert len(rows_of(text, "success")) == 3
     assert text.split('id="curves"')[1].count("<polyline") == 1
+
+
+def test_shifted_evaluations_alone_have_a_best_policy_of_each_task(tmp_path):
+    generator = np.random.default_rng(0)
+    for task, strength in itertools.product(("grasp", "place"), (0.0, 1.0)):
+        run = run_of(task, "imagenet", ("back",), 0, shift=Shift("light", strength))
+        evaluation(tmp_path / task / f"light/{strength:g}", run, 0.9 - strength, generator)
+    told = page.headline(group(collect(tmp_path)))
+    assert told["headline"].startswith("The best trained policy of each of 2 tasks solves")
+    assert "grasp 1" in told["lead"] and "place 1" in told["lead"]
+
+
+def test_one_task_with_a_trained_policy_is_named(tmp_path):
+    generator = np.random.default_rng(0)
+    evaluation(tmp_path / "a", run_of("grasp", "imagenet", ("back",), 0), 0.9, generator)
+    expert = RunConfig(TaskConfig("place"), policy="expert")
+    evaluation(tmp_path / "b", expert, 1.5, generator)
+    told = page.headline(group(collect(tmp_path)))
+    assert told["headline"].startswith("The best trained policy of grasp solves")
+
+
+def test_a_probe_counts_each_held_out_start_once(tmp_path):
+    generator = np.random.default_rng(0)
+    run = run_of("grasp", "imagenet", ("back",), 0)
+    for place in ("a", "b"):
+        evaluation(tmp_path / place, run, 0.5, generator)
+    tried = episode("grasp", run.name, names.VALIDATION_SEED, True, generator)
+    stored = replace(run, starts=Starts(names.VALIDATION_SEED, 1))
+    write_evaluation(tmp_path / "c", [tried], stored, {})
+    probe = {"task": "grasp", "encoder": "imagenet", "view": "back", "tip_mm": 3.0}
+    (row,) = probes.probes([probe], group(collect(tmp_path))).rows
+    assert row.success.endswith("/20")
+
+
+def test_hierarchical_policies_differ_as_a_whole():
+    for views in ((), ("front",)):
+        first, second = (
+            Condition("suture", f"hierarchical-{name}", views, "learned") for name in "ab"
+        )
+        assert factor(first, second) == "hierarchical policy"
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.25, 0.5, 0.75])
+def test_a_shift_stands_in_the_world_that_it_was_added_to(strength):
+    trained = run_of("grasp", "imagenet", ("back",), 0)
+    for axis, more in (("light", {}), ("light", {"light": 0.1}), ("latency", {"latency": 1})):
+        varies = RandomisationConfig(phantom_shift=10.0, **more)
+        world = TaskConfig("grasp", randomisation=varies)
+        plain = evaluated_in(trained, world)
+        shifted = shifted_config(world, AXES[axis], strength)
+        run = evaluated_in(plain, shifted, Shift(axis, strength))
+        found = condition_of(run)
+        assert replace(found, axis="", strength=0.0) == condition_of(plain)
+        # A policy of that world, and what a plan says of it before it is shifted.
+        own = replace(trained, env=world)
+        for env in (world, shifted):
+            found = condition_of(evaluated_in(own, env, Shift(axis, strength)))
+            assert replace(found, axis="", strength=0.0) == condition_of(own)
 
 
 def test_two_evaluations_of_the_same_thing_are_not_counted_as_one(tmp_path):

@@ -62,6 +62,20 @@ def test_bars_say_what_is_left_with_the_worst_axis_first(folder):
     assert widths == sorted(widths) and len(widths) == 3
 
 
+def test_curves_that_were_measured_twice_are_drawn_twice(tmp_path):
+    generator = np.random.default_rng(5)
+    for out, axis, strength in itertools.product("ab", ("light", "blur"), (0.0, 0.5, 1.0)):
+        run = run_of("grasp", "imagenet", ("back",), 0, shift=Shift(axis, strength))
+        place = tmp_path / out / axis / f"{strength:g}"
+        evaluation(place, run, 0.9 - 0.5 * strength, generator, {"checkpoint": CHECKPOINT})
+    groups = group(collect(tmp_path))
+    assert [len(chart.rows) for chart in robustness_curves(groups)] == [2, 2]
+    assert [chart.title for chart in retentions(groups)] == [
+        "grasp: imagenet · a on back",
+        "grasp: imagenet · b on back",
+    ]
+
+
 def test_held_out_looks_stand_beside_those_for_training(folder):
     ((task, label, held_in, held_out, kept),) = looks(group(collect(folder)))
     assert (task, label.split(" ")[0]) == ("insert", "imagenet")

@@ -29,7 +29,16 @@ from surgicai_vision.evaluation.statistics import (
     mcnemar,
     retention,
 )
-from surgicai_vision.evaluation.storage import MARKER, Row, parquet_bytes, read_rows, read_versioned
+from surgicai_vision.evaluation.storage import (
+    EPISODES,
+    FILMS,
+    MARKER,
+    VISITS,
+    Row,
+    parquet_bytes,
+    read_rows,
+    read_versioned,
+)
 from surgicai_vision.training.run_config import Shift
 
 
@@ -123,9 +132,10 @@ def _claim(out: Path, spec: PolicySpec, seeds: Sequence[int]) -> None:
 def _copy(plain: Path, folder: Path, axis: str) -> None:
     """Copy the plain evaluation as the one at strength 0 of another axis, which is the same."""
     folder.mkdir(parents=True, exist_ok=True)
-    for path in plain.iterdir():
-        if path.name != MARKER:
-            files.write_bytes(folder / path.name, path.read_bytes())
+    # A kill after the marker was written may have left finished episodes in the folder as well.
+    for name in (EPISODES, FILMS, VISITS):
+        if (plain / name).exists():
+            files.write_bytes(folder / name, (plain / name).read_bytes())
     stored = read_versioned(plain / MARKER)
     stored["run"]["shift"] = to_mapping(Shift(axis, 0.0))
     files.write_json(folder / MARKER, stored)
