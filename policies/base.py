@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE
+from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE, check_hidden
 from surgicai_vision.core.errors import (
     InputError,
     check_at_least,
@@ -52,8 +52,6 @@ VECTORS: Mapping[str, int] = MappingProxyType(
     }
 )
 """Inputs that may be fed alongside the features: key → length."""
-WIDEST = 65_536
-"""Maximum units of a hidden layer; the bundled policies have 256."""
 MOST_EPOCHS = 1_000_000
 """Maximum number of passes over the training frames."""
 FARTHEST_SHIFT = 1_024
@@ -123,11 +121,7 @@ class Recipe:
         check_name("schedule", self.schedule, ("constant", "one_cycle"))
         check_name("map_head", self.map_head, ("softmax", "convolutions"))
         check_at_least(1, frame_stride=self.frame_stride)
-        if not self.hidden or min(self.hidden) < 1:
-            raise InputError(
-                f"hidden is {self.hidden}; give at least one layer of width 1 or more."
-            )
-        check_at_most(WIDEST, **{"the widest layer of hidden": max(self.hidden)})
+        check_hidden(self.hidden)
         check_at_most(MOST_EPOCHS, epochs=self.epochs)
         check_at_most(FARTHEST_SHIFT, map_shift=self.map_shift)
         if self.epochs < 1 or self.batch_size < 2:

@@ -20,6 +20,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import (
     InputError,
     UnknownName,
+    check_at_most,
     check_name,
     check_positive,
     shown,
@@ -131,6 +132,8 @@ class SuccessRule:
 ACTION_REPEAT_LIMIT = 10
 """Longest time an action may be held [control steps]: 0.2 s. The expert, held for 2, still succeeds
 in grasp, insert and handoff; held for 4 it fails in two of them."""
+WIDEST = 65_536
+"""Maximum units of a hidden layer; the bundled policies have 256."""
 LATENCY_LIMIT = 5
 """Longest latency [control steps]: 100 ms."""
 RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
@@ -176,6 +179,17 @@ RANDOMISATION_CHOICES: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
     }
 )
 """Axis that is a choice → its possible values; "" is off."""
+
+
+def check_hidden(hidden: Sequence[int]) -> None:
+    """Refuse widths of hidden layers that no network of ours may have.
+
+    Raises:
+        InputError: no layer, an empty one, or one wider than `WIDEST`.
+    """
+    if not hidden or min(hidden) < 1:
+        raise InputError(f"hidden is {hidden}; give at least one layer of width 1 or more.")
+    check_at_most(WIDEST, **{"the widest layer of hidden": max(hidden)})
 
 
 @dataclass(frozen=True)

@@ -51,22 +51,24 @@ class EpisodeMonitor:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the last episode."""
+        """Forget the last episode; until the next one begins, nothing is measured."""
         self._watch = None
-        self.slip = 0.0
-        self.turn = 0.0
+        self.slip = self.turn = math.nan
         self.force = 0.0
-        self.tissue_force = 0.0
-        self.tissue_impulse = 0.0
-        self._steps = 0
-        self.tears = math.nan if self._env.simulation.tissue is None else 0.0
-        self.thread_drawn = 0.0 if self._thread else math.nan
+        self.tissue_force = self.tissue_impulse = math.nan
+        self.tears = self.thread_drawn = math.nan
         self.paper_success = False
 
     def reset(self) -> None:
         """Begin an episode; the env has just been reset."""
         self.clear()
         simulation = self._env.simulation
+        self.slip = self.turn = 0.0
+        self.tissue_force = self.tissue_impulse = 0.0
+        if simulation.tissue is not None:
+            self.tears = 0.0
+        if self._thread:
+            self.thread_drawn = 0.0
         self._steps = simulation.task_state.steps
         pair = self._env.stitch.pair
         pairs = [simulation.placement.placed_pair(other) for other in self._layout]

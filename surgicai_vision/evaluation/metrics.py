@@ -18,16 +18,6 @@ from surgicai_vision.evaluation.statistics import clopper_pearson, mean_and_std
 if TYPE_CHECKING:
     from surgicai_vision.envs.visits import Visit
 
-AFTER_THE_START = (
-    "slip_mm",
-    "slip_deg",
-    "tissue_force_n",
-    "tissue_impulse_ns",
-    "tears",
-    "thread_mm",
-)
-"""Columns of largest values and sums, which are NaN where the start could not be made."""
-
 KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
 """Kinds of failure, see `failure_kind`, in the order in which charts stack them."""
 

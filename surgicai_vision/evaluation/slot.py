@@ -11,7 +11,6 @@ take the same steps, so what a person watches is what an evaluation measures.
     episode = slot.take()
 """
 
-import dataclasses
 import math
 import statistics
 from collections.abc import Sequence
@@ -31,7 +30,7 @@ from surgicai_vision.envs.suture import Suture
 from surgicai_vision.envs.upset import Upset, plan_upset
 from surgicai_vision.envs.visits import Visit, VisitWatch
 from surgicai_vision.evaluation.agent import Agent, Env, Observation
-from surgicai_vision.evaluation.metrics import AFTER_THE_START, EpisodeMetrics, failure_kind
+from surgicai_vision.evaluation.metrics import EpisodeMetrics, failure_kind
 
 FILM_FRAMES = 10
 """States kept of each episode, evenly spaced from the first to the last."""
@@ -137,7 +136,6 @@ class Slot:
         self.error = ""
         self._mishap = Upset(self.env, None)
         self._has_begun = False
-        self.monitor.clear()
         try:
             self.observation, self.info = self.env.reset(seed=seed)
             self.touched = bool(self.info.get("contact"))
@@ -147,6 +145,7 @@ class Slot:
             self.agent.reset(self.index, self.env, seed)
         except PhysicsError as error:
             self.info, self.ended, self.error = {}, True, str(error)
+            self.monitor.clear()
         else:
             self._has_begun = True
             plan = plan_upset(seed, self.task_config.task) if self.upset else None
@@ -232,9 +231,6 @@ class Slot:
             false_ends=float(sum(visit.is_false_end for visit in visits)) if watch else math.nan,
             end_delay_s=statistics.median(delays) if delays else math.nan,
         )
-        if not self._has_begun:
-            nothing: dict[str, Any] = dict.fromkeys(AFTER_THE_START, math.nan)
-            row = dataclasses.replace(row, **nothing)
         self.seed = None
         return Episode(row, self._film(), visits)
 

@@ -3,15 +3,15 @@
 from dataclasses import dataclass, field
 from typing import final
 
+from surgicai_vision.core.config import check_hidden
 from surgicai_vision.core.errors import (
     InputError,
     check_at_least,
-    check_at_most,
     check_finite,
     check_positive,
 )
 from surgicai_vision.evaluation.hierarchical_config import ORDER, HierarchicalConfig
-from surgicai_vision.rl.settings import LEAST_BATCH, WIDEST
+from surgicai_vision.rl.settings import LEAST_BATCH
 
 DECISIONS = 1500
 """Decisions to learn from, by default."""
@@ -51,9 +51,7 @@ class HighLevelSettings:
                 f"gamma is {self.gamma}, entropy {self.entropy}; allowed: between 0 and 1, and at "
                 "least 0."
             )
-        if not self.hidden or min(self.hidden) < 1:
-            raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1.")
-        check_at_most(WIDEST, **{"the widest layer of hidden": max(self.hidden)})
+        check_hidden(self.hidden)
 
 
 @final

@@ -5,12 +5,11 @@ from dataclasses import asdict, dataclass, field
 from typing import final
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, SuccessRule, TaskConfig, from_mapping
+from surgicai_vision.core.config import JSON, SuccessRule, TaskConfig, check_hidden, from_mapping
 from surgicai_vision.core.errors import (
     InputError,
     UnknownName,
     check_at_least,
-    check_at_most,
     check_finite,
     check_name,
     check_positive,
@@ -24,8 +23,6 @@ LARGEST_SEED = 2**32 - 1
 """Largest seed of Stable-Baselines3 and d3rlpy, as of NumPy's legacy generator."""
 LEAST_BATCH = 2
 """Smallest batch or rollout: PPO standardises over one, and a policy's recipe records no less."""
-WIDEST = 65_536
-"""Maximum units of a hidden layer: that of a policy's recipe (`policies.base` imports torch)."""
 STOP_AFTER = 2
 """Evaluations in a row that must reach `Settings.stop_at`."""
 
@@ -143,9 +140,7 @@ class Settings:
                 raise InputError(
                     f"{name} is {getattr(self, name)}; it must be above 0 and below 1."
                 )
-        if not self.hidden or min(self.hidden) < 1:
-            raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1.")
-        check_at_most(WIDEST, **{"the widest layer of hidden": max(self.hidden)})
+        check_hidden(self.hidden)
         if not 0 <= self.stop_at <= 1:
             raise InputError(f"stop_at is {self.stop_at}; it must be a share from 0 to 1.")
         _ = self.success_rule  # refuses what is not allowed

@@ -31,6 +31,26 @@ def started(task="grasp", seed=names.TEST_SEED, **options):
     return env, monitor
 
 
+@pytest.mark.parametrize("scene", [SceneConfig(), SceneConfig(tissue="soft", thread=10)])
+def test_nothing_is_measured_before_an_episode_begins(scene):
+    _, monitor = started(scene=scene)
+    is_soft = scene.tissue == "soft"
+
+    def measured():
+        soft_alone = (monitor.tears, monitor.thread_drawn)
+        return (
+            monitor.slip,
+            monitor.turn,
+            monitor.tissue_force,
+            monitor.tissue_impulse,
+        ), soft_alone
+
+    assert measured()[0] == (0.0,) * 4
+    assert measured()[1] == (0.0, 0.0) if is_soft else np.isnan(measured()[1]).all()
+    monitor.clear()
+    assert np.isnan(measured()[0]).all() and np.isnan(measured()[1]).all()
+
+
 def test_a_lying_needle_weighs_what_it_weighs():
     env, _ = started()
     for _ in range(60):

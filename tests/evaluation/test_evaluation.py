@@ -22,7 +22,6 @@ from surgicai_vision.evaluation import policy_spec, slot, storage
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent, RandomAgent, ZeroAgent
 from surgicai_vision.evaluation.metrics import (
-    AFTER_THE_START,
     KINDS,
     EpisodeMetrics,
     as_table,
@@ -89,11 +88,14 @@ class FakeMonitor:
 
     def clear(self):
         self.bite = BiteMeasures()
-        self.force = self.slip = self.turn = self.tissue_force = self.tissue_impulse = 0.0
+        self.force = 0.0
+        self.slip = self.turn = self.tissue_force = self.tissue_impulse = np.nan
         self.tears = self.thread_drawn = np.nan
         self.paper_success = False
 
-    reset = clear
+    def reset(self):
+        self.clear()
+        self.slip = self.turn = self.tissue_force = self.tissue_impulse = 0.0
 
     def is_held(self):
         return self.env._info()["contact"]
@@ -315,6 +317,17 @@ def test_a_needle_that_was_never_held_has_no_slip():
         replace(row_with_stages(1, 0), success=False, failure="missed"),
     ]
     assert summary(rows)["slip_mm"] == {"mean": 0.4, "std": None, "median": 0.4, "n": 1}
+
+
+AFTER_THE_START = (
+    "slip_mm",
+    "slip_deg",
+    "tissue_force_n",
+    "tissue_impulse_ns",
+    "tears",
+    "thread_mm",
+)
+"""Columns of largest values and sums."""
 
 
 def test_nothing_was_measured_where_the_start_could_not_be_made(fake_envs):

@@ -10,8 +10,7 @@ import pytest
 import torch
 import yaml
 
-from policies import base
-from policies.actor import VECTORS
+from policies.actor import VECTORS, ActorRecipe
 from surgicai_vision import envs
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
@@ -22,7 +21,7 @@ from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.rl import train as training
 from surgicai_vision.rl.algorithms import ALGORITHMS
-from surgicai_vision.rl.settings import WIDEST, Request, Settings, settings_of
+from surgicai_vision.rl.settings import Request, Settings, settings_of
 from surgicai_vision.rl.train import train
 from surgicai_vision.training.folder import STATE
 from surgicai_vision.training.policies import load_policy
@@ -272,7 +271,8 @@ def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, caps
         assert f"{setting} is 1; it must be at least 2" in refused(algo, "--change", f"{setting}=1")
     with pytest.raises(InputError, match="at most 65536"):
         settings_of("td3", {"hidden": [65_537]})
-    assert WIDEST == base.WIDEST  # what a policy's recipe allows
+    with pytest.raises(InputError, match="at most 65536"):  # as a policy's recipe does
+        ActorRecipe(hidden=(65_537,))
     shown = ("--demos", str(demos["grasp"]))
     for algo, share, rows in (("td3-bc", 0.001, 0), ("rlpd", 0.999, 256)):
         assert f"{rows} of the 256" in refused(algo, *shown, "--change", f"demo_share={share}")
