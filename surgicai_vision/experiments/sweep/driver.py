@@ -318,10 +318,7 @@ class _Sweep:
     def _train(self, policies: Iterable[Training]) -> dict[str, SurgicaiError]:
         """Train policies that are not there yet and file them; return the errors by job's key."""
         errors: dict[str, SurgicaiError] = {}
-        placed = [
-            (self.jobs.policy(policy), _Place(self.jobs.policy_folder(policy), JOB_FILE))
-            for policy in policies
-        ]
+        placed = [(self.jobs.policy(policy), self._policy_place(policy)) for policy in policies]
         self._do_and_file("policies", placed, lambda job, place, error: errors.update({job: error}))
         return errors
 
@@ -341,8 +338,7 @@ class _Sweep:
             for state in live
         ]
         placed += [
-            (self.jobs.reference(run), _Place(self._reference_folder(run), REFERENCE_FILE))
-            for run in self.references
+            (self.jobs.reference(run), self._reference_place(run)) for run in self.references
         ]
 
         def failed(job: str, place: _Place, error: SurgicaiError) -> None:
@@ -398,16 +394,17 @@ class _Sweep:
             self._run(title, left, ended)
 
     def _is_filed(self, policy: Training) -> bool:
-        place = _Place(self.jobs.policy_folder(policy), JOB_FILE)
-        return place.holds(self.jobs.policy(policy).key())
+        return self._policy_place(policy).holds(self.jobs.policy(policy).key())
+
+    def _policy_place(self, policy: Training) -> _Place:
+        return _Place(self.jobs.policy_folder(policy), JOB_FILE)
 
     def _is_filed_reference(self, run: RunConfig) -> bool:
-        place = _Place(self._reference_folder(run), REFERENCE_FILE)
-        return place.holds(self.jobs.reference(run).key())
+        return self._reference_place(run).holds(self.jobs.reference(run).key())
 
-    def _reference_folder(self, run: RunConfig) -> Path:
+    def _reference_place(self, run: RunConfig) -> _Place:
         parts = [run.policy, run.task, *([run.condition] if run.condition else [])]
-        return self.out / "references" / "-".join(parts)
+        return _Place(self.out / "references" / "-".join(parts), REFERENCE_FILE)
 
     def _note(self, what: str, error: SurgicaiError) -> None:
         """Note what went wrong outside the runs, in one line."""
