@@ -3,14 +3,19 @@
 Both are plain data, so that listing encoders loads no torch.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from surgicai_vision.core.errors import InputError, check_at_least, check_name, check_positive
+
 if TYPE_CHECKING:
     from torch import nn
+
+INTERPOLATIONS = ("bilinear", "bicubic")
+CHANNEL_ORDERS = ("RGB", "BGR")
 
 
 @dataclass(frozen=True)
@@ -20,7 +25,7 @@ class EncoderCard:
     Attributes:
         name: the name users give.
         architecture: the network, in words of the library that builds it.
-        source: hub repository, package or "seed" the weights come from.
+        source: hub repository, package, place or "seed" the weights come from.
         revision: revision of that repository, version of that package, or the seed.
         filename: the weights file's name there; None where no file exists.
         sha256: the file's hash; None is said as "unpinned": the hub's own hash is taken.
@@ -59,6 +64,19 @@ class EncoderCard:
     layers: str = ""
     channel_order: str = "RGB"
     batch: int = 8
+
+    def __post_init__(self) -> None:
+        check_name("interpolation", self.interpolation, INTERPOLATIONS)
+        check_name("channel_order", self.channel_order, CHANNEL_ORDERS)
+        check_at_least(1, input_size=self.input_size, dim=self.dim, batch=self.batch)
+        statistics: tuple[Sequence[float], ...] = (self.mean, self.std)
+        if any(len(values) != 3 for values in statistics):
+            raise InputError(
+                f"mean is {self.mean}, std {self.std}; each has three values, of R, G and B."
+            )
+        check_positive(
+            **{f"std of {channel}": of for channel, of in zip("RGB", self.std, strict=True)}
+        )
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ Imports no torch before a file is read, so that a card can be looked up at once.
 """
 
 import pickle
+import struct
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,10 +24,14 @@ DAMAGED = (
     EOFError,
     OSError,
     ValueError,
-    KeyError,
+    LookupError,
+    TypeError,
+    AssertionError,
+    struct.error,
     zipfile.BadZipFile,
 )
-"""What `torch.load` raises on a file that is no torch file, cut short, or not tensors alone."""
+"""What `torch.load` raises on a file that is no torch file, cut short, damaged, or not tensors
+alone."""
 
 
 def read_tensors(path: Path) -> "dict[str, torch.Tensor]":

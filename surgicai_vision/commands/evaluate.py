@@ -121,6 +121,9 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
                 raise InputError(
                     f"{option} does not go with --expert-swap {ALL}; give one subtask."
                 )
+        if options.dataset:
+            raise InputError("--dataset is only for replay; leave it out.")
+        _filming(options)  # refuses options that go with --video
         return _evaluate_swaps(options, console)
     spec = open_given(
         options.policy,
@@ -234,6 +237,10 @@ def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
     if path.suffix not in SUFFIXES:
         raise InputError(
             f"--expert-swap {ALL} is for the YAML file of a hierarchical policy; leave it out."
+        )
+    if options.task not in (None, names.SUTURE):
+        raise InputError(
+            f"--task {options.task}: {options.policy} does the whole procedure; leave --task out."
         )
     weights = WeightsSource.parse(options.weights, options.accept_licence)
     variants = variants_of(path, cast("dict[str, JSON] | None", options.env), weights)

@@ -54,7 +54,7 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Replay the demonstrations and write their transitions."""
-    from surgicai_vision.demos.store import list_demos, read_demo
+    from surgicai_vision.demos.store import first_demos, read_demo
     from surgicai_vision.rl import export
     from surgicai_vision.rl.extra import check_extra
     from surgicai_vision.rl.transitions import of_demos
@@ -63,7 +63,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     if options.format == "d3rlpy" and options.obs_type == "goal":
         raise InputError("d3rlpy takes no goal dicts; give --obs-type relative or state.")
     demos = options.demos or folders.demos_folder(options.task or "grasp")
-    paths = list_demos(demos)[: options.episodes]
+    paths = first_demos(demos, options.episodes)
     recorded = read_demo(paths[0]).config
     folders.check_task(options.task, recorded.task, demos)
     name = f"{recorded.task}-{options.obs_type}-{options.format}"

@@ -166,13 +166,9 @@ def _learner(folder: Path, config: TaskConfig) -> "Learner":
 
 def _demos(options: Options) -> list[Path]:
     """Return the demonstrations to learn from or to re-pose."""
-    from surgicai_vision.demos.store import list_demos
+    from surgicai_vision.demos.store import first_demos
 
     if options.from_ is None:
         return []
-    paths = list_demos(options.from_)
     chooses = options.demonstrator in CHOOSING_DEMONSTRATORS
-    count = options.demos_used or (len(paths) if chooses else 1)
-    if count > len(paths):
-        raise InputError(f"--demos-used is {count}; {options.from_} holds {len(paths)}.")
-    return paths[:count]
+    return first_demos(options.from_, options.demos_used or (None if chooses else 1))

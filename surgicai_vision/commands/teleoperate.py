@@ -140,6 +140,11 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 def _config(options: Options) -> TaskConfig:
     """Return the task's configuration with the time that a person needs."""
     config = task_config(options.task, options.env)
+    if config.action_repeat != 1:
+        raise InputError(
+            f"env: action_repeat is {config.action_repeat}; a person moves the arm at every "
+            "control step. Leave it out ('export-demos' can hold the actions)."
+        )
     if options.env and options.env.get("max_steps"):
         if options.seconds is not None:
             raise InputError("--seconds and env: max_steps set the same limit; give only one.")

@@ -38,7 +38,7 @@ from surgicai_vision.rl.algorithms import ALGORITHMS, LEARNED
 from surgicai_vision.rl.high_level_config import DECISIONS, SAVE_EVERY, HighLevelRequest
 from surgicai_vision.rl.residual_config import ALGO, BOUND, ResidualRequest, residual_settings
 from surgicai_vision.training import policies
-from surgicai_vision.training.checkpoint import REQUEST, Checkpoint, read_checkpoint
+from surgicai_vision.training.checkpoint import LOCK, REQUEST, Checkpoint, read_checkpoint
 from surgicai_vision.training.run_config import RunConfig, with_budget
 
 if TYPE_CHECKING:
@@ -103,7 +103,8 @@ class Options:
         algo: Train an actor on the state by this algorithm of reinforcement or offline learning
             (docs/rl.md); --change then changes the algorithm's settings.
         demos: With --algo, folder of demonstrations to learn from; otherwise the demonstrations of
-            the dataset, for a policy that plans chunks when the dataset has few frames.
+            the dataset, in the order in which they were rendered, for a policy that plans chunks
+            when the dataset has few frames.
         demonstrations: Use only the first N demonstrations of --demos, or of the dataset.
         observation: With --algo, what the actor sees of the state.
         env_steps: With --algo, control steps in the env; offline algorithms take none.
@@ -165,7 +166,9 @@ class Options:
         Path | None, DIRECTORY, default_text("outputs/train/<task>-<policy>-seed<seed>")
     ] = None
     algo: Annotated[str | None, Parameter(choices=tuple(ALGORITHMS))] = None
-    demos: Annotated[Path | None, DIRECTORY, default_text("outputs/demos/<task>")] = None
+    demos: Annotated[
+        tuple[Path, ...], Parameter(metavar="DIR[,DIR]"), default_text("outputs/demos/<task>")
+    ] = ()
     demonstrations: Annotated[int | None, COUNT, default_text("all")] = None
     observation: Annotated[str, Parameter(choices=("relative", "state"))] = "relative"
     env_steps: Annotated[int, COUNT] = 50_000
@@ -200,10 +203,16 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         encoders.find_weights(encoder, weights)
     from surgicai_vision.experiments.run import train_run
 
-    if options.subtask and policies.policy_plugin(options.policy).target == names.STAGE:
+    plugin = policies.policy_plugin(options.policy)
+    if options.subtask and plugin.target == names.STAGE:
         raise InputError(
             f"Policy '{options.policy}' learns from whole procedures; leave --subtask "
             f"{options.subtask} out."
+        )
+    if options.demos and plugin.offsets is None:
+        raise InputError(
+            f"Policy '{options.policy}' learns from the frames of the dataset and reads no "
+            "demonstrations; leave --demos out."
         )
     run = RunConfig(
         TaskConfig(names.SUTURE if options.subtask else options.task or "grasp"),
@@ -224,7 +233,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     folders.check_task(options.task, task, rendered.path)
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = options.out or folders.train_folder(label, run.name, run.seed)
-    folders.check_folder(out, REQUEST)
+    folders.check_folder(out, REQUEST, ours=(LOCK,))
     is_high_level = policies.policy_plugin(run.policy).target == names.STAGE
     if rendered.late and not is_high_level:
         console.note(
@@ -345,7 +354,7 @@ def _refuse_unread(options: Options) -> None:
 
 def _reinforce(options: Options, algo: str, console: Console) -> dict[str, object]:
     """Train an actor by reinforcement or offline learning; print where the checkpoints are."""
-    from surgicai_vision.demos.store import demos_digest, list_demos
+    from surgicai_vision.demos.store import demos_digest, first_demos
     from surgicai_vision.rl.extra import check_extra
     from surgicai_vision.rl.settings import Request, settings_of
 
@@ -357,8 +366,13 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
     task = options.task or "grasp"
     demos: list[Path] = []
     if algorithm.needs_demos:
-        folder = options.demos or folders.demos_folder(task)
-        demos = list_demos(folder)[: options.demonstrations]
+        if len(options.demos) > 1:
+            raise InputError(
+                f"--algo {algo} learns from one folder of demonstrations; --demos names "
+                f"{len(options.demos)}."
+            )
+        folder = options.demos[0] if options.demos else folders.demos_folder(task)
+        demos = first_demos(folder, options.demonstrations)
         task = folders.demos_task(folder)
         folders.check_task(options.task, task, folder)
     elif options.demos or options.demonstrations:

@@ -11,6 +11,7 @@ import json
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar, cast
 
@@ -395,20 +396,29 @@ def convert(hint: object, value: object, where: str) -> object:
     origin = typing.get_origin(hint)
     arguments = typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        return convert(next(a for a in arguments if a is not type(None)), value, where)
+        return _convert_to_one(arguments, value, where)
+    if origin is typing.Literal:
+        if value not in arguments:
+            allowed = ", ".join(map(repr, arguments))
+            raise InputError(f"{where}: {shown(value)} is unknown; allowed: {allowed}.")
+        return value
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_mapping(hint, cast(Mapping[str, object], value), where)
-    if origin is tuple:
-        if isinstance(value, str) or not isinstance(value, (list, tuple)):
+    if origin in (tuple, list):
+        if not isinstance(value, list | tuple):
             raise InputError(f"{where}: expected a list, got {shown(value)}.")
-        if Ellipsis not in arguments and len(value) != len(arguments):
-            raise InputError(f"{where}: expected {len(arguments)} values, got {len(value)}.")
-        return tuple(convert(arguments[0], item, where) for item in value)
+        hints = arguments
+        if origin is list or Ellipsis in arguments:
+            hints = arguments[:1] * len(value)
+        if len(value) != len(hints):
+            raise InputError(f"{where}: expected {len(hints)} values, got {len(value)}.")
+        return origin(convert(of, item, where) for of, item in zip(hints, value, strict=True))
     if origin in (dict, Mapping):
         if not isinstance(value, Mapping):
             raise InputError(f"{where}: expected a table of keys, got {shown(value)}.")
+        for key in value:
+            if not isinstance(key, str):
+                raise InputError(f"{where}: the key {shown(key)} is not text; put it in quotes.")
         return value
     if isinstance(value, int) and not -LARGEST_INTEGER <= value <= LARGEST_INTEGER:
         raise InputError(
@@ -421,6 +431,17 @@ def convert(hint: object, value: object, where: str) -> object:
     ):
         raise InputError(f"{where}: expected {hint.__name__}, got {shown(value)}.")
     return value
+
+
+def _convert_to_one(hints: Sequence[object], value: object, where: str) -> object:
+    """Return `value` as the first of several types that it fits; see `convert`."""
+    if value is None and type(None) in hints:
+        return None
+    *others, last = (hint for hint in hints if hint is not type(None))
+    for hint in others:
+        with suppress(InputError):
+            return convert(hint, value, where)
+    return convert(last, value, where)
 
 
 def to_mapping(config: "DataclassInstance") -> dict[str, JSON]:

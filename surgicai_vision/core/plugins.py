@@ -53,12 +53,15 @@ type Fault = Callable[[object], str]
 
 
 class NameCollision(InputError):
-    """Two distributions offer a part of the same kind under the same name."""
+    """Two distributions offer a part of the same kind under the same name, or one does twice."""
 
     def __init__(self, kind: str, name: str, first: str, second: str):
         super().__init__(
             f"The {kind} '{name}' is offered by '{first}' and by '{second}'; "
             "uninstall one of them or ask its author for another name."
+            if first != second
+            else f"The {kind} '{name}' is offered twice by '{first}'; give it another name, or "
+            "start Python anew to replace it."
         )
 
 

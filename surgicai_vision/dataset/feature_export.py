@@ -7,7 +7,7 @@ accept without any image. `features` in `meta/surgicai.json` names the encoder, 
 provide the same features.
 """
 
-import tempfile
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.core.files import TEMPORARY, check_output, write_json
+from surgicai_vision.core.executor import building
+from surgicai_vision.core.files import check_output, write_json
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.reader import RenderedDataset
@@ -54,8 +55,10 @@ def export_features(
     features[names.ENVIRONMENT_STATE] = {"dtype": "float32", "shape": (width,), "names": None}
     held = dataset.columns()
     columns = {key: held[key] for key in schema.COLUMNS}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=TEMPORARY) as scratch:
+    with building(out) as (store, result):
+        scratch = store / "episodes"
+        shutil.rmtree(scratch, ignore_errors=True)  # left by a run that was killed
+        scratch.mkdir()
         shards = []
         digests = []
         for episode in np.unique(dataset.episode_index):
@@ -65,7 +68,7 @@ def export_features(
             part[names.ENVIRONMENT_STATE] = np.concatenate(
                 [entry[where] for entry in rows], axis=1
             ).astype(np.float32)
-            shards.append(_write_shard(Path(scratch) / str(episode), part))
+            shards.append(_write_shard(scratch / str(episode), part))
         meta = {
             **dataset.meta,
             "request": None,  # it is not what was rendered
@@ -76,7 +79,7 @@ def export_features(
             "exported_from": dataset.fingerprint,
             "digest": schema.dataset_digest(digests),
         }
-        assemble(shards, out, features, task_text(dataset.task), meta)
+        assemble(shards, result, features, task_text(dataset.task), meta)
 
 
 def _write_shard(folder: Path, columns: Mapping[str, NDArray[np.generic]]) -> Path:

@@ -15,7 +15,8 @@ the demonstrator had not yet noticed the loss (`record-demos --late`). Visits of
 Reward and success are the subtask's own, measured anew in the recorded states; in a recording of
 the procedure, success is that of the whole procedure.
 
-The folder is written atomically; repeating the same request reuses it.
+The folder is written atomically; repeating the same request reuses it, and removes what a killed
+run left next to it.
 """
 
 import dataclasses
@@ -29,6 +30,7 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output, whole_folder
 from surgicai_vision.core.progress import Stage, silent_stage
 from surgicai_vision.core.runs import runs_of
@@ -72,8 +74,11 @@ def cut_demos(demos: Path, subtask: str, *, out: Path, stage: Stage = silent_sta
     check_output(out, may_resume=MARKER)
     if finished(out, request):
         return list_demos(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with whole_folder(out) as folder, stage(f"visits of {subtask}", "procedures") as progress:
+    with (
+        building(out) as (_, result),
+        whole_folder(result) as folder,
+        stage(f"visits of {subtask}", "procedures") as progress,
+    ):
         count = 0
         for done, path in enumerate(paths, 1):
             for visit in visits(read_demo(path), subtask):

@@ -280,6 +280,19 @@ def list_demos(folder: Path) -> list[Path]:
     return paths
 
 
+def first_demos(folder: Path, count: int | None) -> list[Path]:
+    """Return the files of the first `count` episodes of a folder of demonstrations; None: all.
+
+    Raises:
+        BadFile: as `list_demos`.
+        InputError: it holds fewer.
+    """
+    paths = list_demos(folder)
+    if count is not None and count > len(paths):
+        raise InputError(f"{count} demonstrations were requested; {folder} holds {len(paths)}.")
+    return paths[:count]
+
+
 def demos_digest(paths: list[Path]) -> str:
     """Return the sha256 over the episodes' files, in order."""
     return digest([sha256_file(path) for path in paths])

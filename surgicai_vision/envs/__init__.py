@@ -5,6 +5,7 @@
 fields of `TaskConfig`, except `max_steps`: gymnasium's `max_episode_steps` sets the limit there.
 """
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Iterable, Mapping, Sequence
@@ -105,7 +106,8 @@ def make_task(
     chosen = scene or SceneConfig()
     if not isinstance(chosen, SceneConfig):
         chosen = from_mapping(SceneConfig, chosen, "scene")
-    return make(TaskConfig(task=task, scene=chosen, randomisation=axes, **fields), **arguments)
+    config = from_mapping(TaskConfig, {"task": task, **fields}, "env")
+    return make(dataclasses.replace(config, scene=chosen, randomisation=axes), **arguments)
 
 
 def make_registered(task: str, **arguments: Any) -> SuturingEnv:

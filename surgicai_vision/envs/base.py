@@ -192,22 +192,23 @@ class SuturingEnv(gymnasium.Env):
         if self.config.hold_jaw and self.subtask.starts_held:
             action = np.array([*self._checked(action)[:6], 0.0], np.float32)
         for _ in range(self.config.action_repeat - 1):
-            before = self._control_step(action)
+            before = self._control_step(action, is_last=False)
             if before[2] or before[3]:
                 return before
         return self._control_step(action)
 
     def _control_step(
-        self, action: NDArray[np.float32]
+        self, action: NDArray[np.float32], is_last: bool = True
     ) -> tuple[Observation, float, bool, bool, Info]:
-        """Take one control step of 20 ms."""
+        """Take one control step of 20 ms; `is_last` as in `_after`."""
         self._moves += 1
         simulation = self.simulation
         if self._is_absolute:
-            return self._after(simulation.advance_to(absolute.follow(action, simulation)))
-        return self._after(
-            simulation.advance(self.subtask.arm, self._checked(action), self._step_size)
-        )
+            is_physical = simulation.advance_to(absolute.follow(action, simulation))
+        else:
+            given = self._checked(action)
+            is_physical = simulation.advance(self.subtask.arm, given, self._step_size)
+        return self._after(is_physical, is_last)
 
     def step_commands(
         self, commands: Mapping[str, Command], halfway: Callable[[], None] | None = None
@@ -221,8 +222,16 @@ class SuturingEnv(gymnasium.Env):
         self._moves += 1
         return self._after(self.simulation.advance_to(commands, halfway))
 
-    def _after(self, is_physical: bool) -> tuple[Observation, float, bool, bool, Info]:
-        """Judge and observe the state that a control step has led to."""
+    def _after(
+        self, is_physical: bool, is_last: bool = True
+    ) -> tuple[Observation, float, bool, bool, Info]:
+        """Judge and observe the state that a control step has led to.
+
+        Args:
+            is_physical: the physics has not diverged.
+            is_last: of a held action; what another one has led to is observed, and its images are
+                rendered, only if the episode ends there.
+        """
         simulation = self.simulation
         state = simulation.task_state
         subtask = self.subtask
@@ -238,14 +247,15 @@ class SuturingEnv(gymnasium.Env):
         if self._progress(info):
             target = self._target()
         terminated = info["is_success"] or info["physics_error"]
-        seen = self._observe(target)
-        simulation.forget_reads()
-        if self.render_mode == "human":
-            self._shown().step(info)
         truncated = self._truncates and state.steps >= self.config.max_steps
         if self.config.end_on_drop:
             info["dropped"] = self.subtask.starts_held and simulation.has_dropped(self.subtask.arm)
             truncated = truncated or info["dropped"]
+        is_seen = is_last or terminated or truncated
+        seen: Observation = self._observe(target) if is_seen else {}
+        simulation.forget_reads()
+        if self.render_mode == "human":
+            self._shown().step(info)
         return seen, self.reward(info), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -329,7 +339,7 @@ class SuturingEnv(gymnasium.Env):
     @property
     def _max_episode_steps(self) -> int:
         """Return the episode limit where LeRobot looks for it: this env truncates itself."""
-        return self.config.max_steps
+        return most_actions(self.config)
 
     @property
     def subtask(self) -> Subtask:
@@ -651,6 +661,11 @@ def _refuse_increments(config: TaskConfig) -> None:
             f"{given} changes increments, but in action mode 'absolute' an action is the "
             "set-point of both arms; leave it out."
         )
+
+
+def most_actions(config: TaskConfig) -> int:
+    """Return the most actions in an episode: what gymnasium and LeRobot count as its steps."""
+    return -(-config.max_steps // config.action_repeat)
 
 
 def staged_reward(

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names, check_camera
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_name, shown
 from surgicai_vision.envs import poses
 from surgicai_vision.scene.kinematics import STARTS, Pose
 from surgicai_vision.scene.rotations import (
@@ -70,6 +70,9 @@ class ObservationConfig:
         check_name("action mode", self.action_mode, names.ACTION_MODES)
         for camera in self.cameras:
             check_camera(camera)
+        for name, asked in (("depth", self.depth), ("segmentation", self.segmentation)):
+            if not isinstance(asked, bool):
+                raise InputError(f"{name} is {shown(asked)}; allowed: True or False.")
         if len(set(self.cameras)) != len(self.cameras):
             raise InputError(f"cameras names one view twice: {', '.join(self.cameras)}.")
         if self.visual and not self.cameras:
@@ -92,8 +95,8 @@ class ObservationConfig:
     @property
     def modalities(self) -> tuple[str, ...]:
         """Return what is rendered for each camera, a subset of `names.MODALITIES`."""
-        shown = {names.RGB: True, names.DEPTH: self.depth, names.SEGMENTATION: self.segmentation}
-        return tuple(modality for modality in names.MODALITIES if shown[modality])
+        asked = {names.RGB: True, names.DEPTH: self.depth, names.SEGMENTATION: self.segmentation}
+        return tuple(modality for modality in names.MODALITIES if asked[modality])
 
     def space(self) -> spaces.Space[object]:
         """Return the observation space."""

@@ -45,8 +45,8 @@ def make_dataset(
         The dataset's folder; that of the demonstrations where nothing is rendered.
     """
     recorded = dataset.demonstrations
-    beside = [] if dataset.visited is None else [_cut(dataset.visited, recorded, folder, context)]
-    beside += _learned(dataset, folder)
+    if dataset.visited is not None:
+        _cut(dataset.visited, recorded, folder, context)
     few = dataset.multiplied
     demos = [] if few is None else list_demos(_recorded(few, folder, context))
     return prepare_dataset(
@@ -62,21 +62,25 @@ def make_dataset(
         disturbance=recorded.disturbance,
         post_success_steps=recorded.post_success_steps,
         seed=dataset.first_seed,
-        beside=beside,
+        beside=demos_folders(dataset, folder)[1:],
         demos=demos,
         variants=recorded.looks,
         learner=learner,
     )
 
 
-def _learned(dataset: DatasetConfig, folder: Path) -> list[Path]:
-    """Return the demonstrations the learner was trained on, those of its learner, and so on."""
+def demos_folders(dataset: DatasetConfig, folder: Path) -> list[Path]:
+    """Return the folders of the demonstrations that `make_dataset` renders, in order.
+
+    They are its own, the visits, what its learner was trained on, what the learner in those was
+    trained on, and so on.
+    """
+    visits = [] if dataset.visited is None else [folder / "visits"]
     first = dataset.learned
-    if first is None:
-        return []
-    made = folder.parent / first.demonstrations.name
-    visits = [] if first.visited is None else [made / "visits"]
-    return [made / "demos", *visits, *_learned(first, made)]
+    learned = (
+        [] if first is None else demos_folders(first, folder.parent / first.demonstrations.name)
+    )
+    return [folder / "demos", *visits, *learned]
 
 
 def _recorded(other: DatasetConfig, folder: Path, context: RunContext) -> Path:
@@ -87,11 +91,10 @@ def _recorded(other: DatasetConfig, folder: Path, context: RunContext) -> Path:
 
 def _cut(
     visited: DatasetConfig, recorded: Demonstrations, folder: Path, context: RunContext
-) -> Path:
-    """Cut the visits of a task out of whole procedures; return their folder."""
+) -> None:
+    """Cut the visits of a task out of whole procedures."""
     whole = _recorded(visited, folder, context)
     cut_demos(whole, recorded.task, out=folder / "visits", stage=context.stage)
-    return folder / "visits"
 
 
 def prepare_dataset(

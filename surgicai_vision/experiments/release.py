@@ -34,7 +34,7 @@ from surgicai_vision.experiments.dagger import learner_of
 from surgicai_vision.experiments.dataset_config import Demonstrations
 from surgicai_vision.experiments.plan_config import Plan, plan_of
 from surgicai_vision.experiments.plan_parts import PlannedPolicy
-from surgicai_vision.experiments.prepare import check_dataset, make_dataset
+from surgicai_vision.experiments.prepare import check_dataset, demos_folders, make_dataset
 from surgicai_vision.experiments.run import train_run
 from surgicai_vision.features import encoders
 from surgicai_vision.scene import build_scene
@@ -178,11 +178,14 @@ class _Build:
         """Train a policy if that is not done yet; return its folder."""
         folder = self.out / "policies" / policy.name
         if not (folder / CARD).exists():
-            dataset: Dataset = open_dataset(self._dataset(self.plan.recorded(policy)))
+            recorded = self.plan.recorded(policy)
+            dataset: Dataset = open_dataset(self._dataset(recorded))
             if policy.subtask:  # before encoding, so that no other frame is encoded
                 dataset = of_subtask(dataset, policy.subtask)
             run = self.plan.training(policy, self.plan.seed[0])
-            train_run(run, dataset, folder, self.context.stage)
+            shown = self.plan.dataset(recorded, self.plan.seed[0])
+            demos = demos_folders(shown, self.out / recorded.name)
+            train_run(run, dataset, folder, self.context.stage, demos=demos)
         return folder
 
     def _dataset(self, recorded: Demonstrations) -> Path:

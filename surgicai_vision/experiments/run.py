@@ -30,7 +30,7 @@ from surgicai_vision.features.devices import AUTO, CPU, find_device
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import REQUEST
-from surgicai_vision.training.chunks import timeline_of, with_chunks
+from surgicai_vision.training.chunks import Timeline, timeline_of, with_chunks
 from surgicai_vision.training.progress_input import check_progress_policy, with_progress
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.train import epochs_within, train
@@ -46,7 +46,7 @@ def train_run(
     start: Path | None = None,
     progress_from: Path | None = None,
     subtask: str | None = None,
-    demos: Path | None = None,
+    demos: Sequence[Path] = (),
     save_every: int = 0,
     device: str | None = None,
     log: Callable[[int, dict[str, float]], None] | None = None,
@@ -63,8 +63,8 @@ def train_run(
         progress_from: checkpoint folder of the policy that predicts the progress, for a recipe with
             `progress_input`.
         subtask: train on this subtask's frames of the dataset's whole procedures.
-        demos: folder of the dataset's demonstrations, for a policy that plans chunks where the
-            dataset was rendered with fewer frames than control steps.
+        demos: folders of the dataset's demonstrations, in order, for a policy that plans chunks
+            where the dataset was rendered with fewer frames than control steps.
         save_every: also keep a checkpoint every `save_every` epochs.
         device: where to encode and train, one of `features.devices.DEVICES`; by default a
             GPU encodes, if there is one, and the CPU trains.
@@ -78,6 +78,8 @@ def train_run(
     encodes_on = AUTO if device is None else find_device(device)
     trains_on = CPU if device is None else encodes_on
     dataset = with_frame_stride(dataset, recipe.frame_stride)
+    # Missing demonstrations are found before anything is encoded.
+    timeline = timeline_of(dataset, demos) if plugin.offsets is not None else None
     progress_policy = policies.load_policy(progress_from) if progress_from else None
     if progress_policy is not None:
         check_progress_policy(progress_policy.checkpoint, dataset)
@@ -87,7 +89,7 @@ def train_run(
     learned = _Learned(dataset, _encode(run, dataset, stage, weights, encodes_on))
     if progress_policy is not None:
         learned = learned.select(_fed(dataset, progress_policy, stage, weights))
-    for select in _selections(run, plugin, recipe, dataset, subtask, demos):
+    for select in _selections(run, plugin, recipe, dataset, subtask, timeline):
         learned = learned.select(select(learned.dataset))
     recipe = _within_budget(recipe, learned, run, out, trains_on)
     with stage(f"policy: {run.name}", "epochs") as progress:
@@ -168,15 +170,15 @@ def _selections(
     recipe: Recipe,
     dataset: Dataset,
     subtask: str | None,
-    demos: Path | None,
+    timeline: Timeline | None,
 ) -> Iterator[Callable[[Dataset], DatasetSubset]]:
     """Yield the selections of a run's frames of `dataset`, each applied to the result before it.
 
     Chunks of actions come first, because they reach into frames that are left out later.
     """
-    if plugin.offsets is not None:
+    if plugin.offsets is not None and timeline is not None:
         offsets = plugin.offsets(recipe)
-        yield lambda present: with_chunks(present, timeline_of(present, demos), offsets)
+        yield lambda present: with_chunks(present, timeline, offsets)
     if run.demonstrations not in (None, len(np.unique(dataset.demonstration_index))):
         yield functools.partial(first_episodes, count=run.demonstrations)
     if subtask is not None:

@@ -7,7 +7,7 @@
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, cast
@@ -91,13 +91,19 @@ def encoder_names() -> tuple[str, ...]:
 
 
 def encoder_plugin(name: str) -> "Plugin":
-    """Import the plug-in of `name`; `UnknownName` lists what exists."""
+    """Import the plug-in of `name`; `UnknownName` lists what exists.
+
+    Its card has this name whatever its author calls it, since checkpoints name their encoder by it.
+    """
     check_encoder_name(name)
     for prefix, target in OPEN_ENCODERS.items():
         if name.startswith(prefix):
             plugin: Plugin = resolve(target)(name)
             return plugin
-    return ENCODERS.load(name)
+    plugin = ENCODERS.load(name)
+    if ENCODERS.is_ours(name):
+        return plugin
+    return replace(plugin, card=replace(plugin.card, name=name))
 
 
 def _choices() -> tuple[str, ...]:
@@ -227,7 +233,7 @@ def _built(name: str, built: object) -> "tuple[EncoderCard, nn.Module]":
     card, network = built
     if _is_card(card) or not isinstance(network, resolve("torch.nn:Module")):
         raise ENCODERS.refusal(name, wrong.format(shown(built)))
-    return card, network
+    return replace(card, name=name), network
 
 
 def find_weights(name: str, weights: WeightsSource = ANYWHERE) -> Path | None:

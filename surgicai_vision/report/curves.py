@@ -103,15 +103,8 @@ def with_zero(groups: Sequence[Group], axis: str) -> list[Group]:
 
 
 def base_of(item: Group) -> Condition:
-    """Return the condition without its shift.
-
-    Its place is that of all its curves: `robustness` stores each as `<axis>/<strength>`.
-    """
-    condition = item.condition
-    place = condition.place
-    if condition.axis:
-        place = f"/{place}".removesuffix(f"/{condition.axis}/{condition.strength:g}")
-    return replace(condition, axis="", strength=0.0, place=place.removeprefix("/"))
+    """Return the condition without its shift."""
+    return replace(item.condition, axis="", strength=0.0)
 
 
 def _area(items: Sequence[Group]) -> str:

@@ -6,7 +6,7 @@ seeds: mean ± standard deviation of the cells' rates, and a hierarchical bootst
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -129,13 +129,18 @@ class Group:
         return statistics.mean_and_std([float(row[column]) for row in self.rows if row["success"]])
 
     def across_text(self) -> str:
-        """Return "31.0 ± 4.2 % (22–40 %); by seed 28, 34", or a dash for one training seed."""
+        """Return "31.0 ± 4.2 % (22–40 %); by seed 28, 34", or a dash for one training seed.
+
+        Seeds with different numbers of episodes are given as "2/5, 14/20".
+        """
         if self.across is None:
             return text.ABSENT
         mean = 100 * self.across.mean
         std = 100 * self.across.std
-        counts = [sum(bool(row["success"]) for row in result.rows) for result in self.results]
-        by_seed = ", ".join(map(str, counts))
+        won = [sum(bool(row["success"]) for row in result.rows) for result in self.results]
+        of = [len(result.rows) for result in self.results]
+        counts = [f"{k}/{n}" if len(set(of)) > 1 else str(k) for k, n in zip(won, of, strict=True)]
+        by_seed = ", ".join(counts)
         bounds = percentages.interval(self.across.interval)
         return f"{mean:.1f} ± {std:.1f} % ({bounds}); by seed {by_seed}"
 
@@ -182,12 +187,16 @@ def best_trained(groups: Sequence[Group]) -> Group | None:
 def as_trained(groups: Sequence[Group]) -> list[Group]:
     """Return the evaluations without a shift, on held-out starts.
 
-    If there are none without a shift, return those at strength 0, else all. If none of these is on
-    held-out starts, return those on others.
+    If there are none without a shift, return those at strength 0, of one axis each, else all. If
+    none of these is on held-out starts, return those on others.
     """
     evaluated = [item for item in groups if item.episodes]
     plain = [item for item in evaluated if item.condition.plain]
-    shown = plain or [item for item in evaluated if not item.condition.strength] or evaluated
+    unshifted: dict[Condition, Group] = {}
+    for item in evaluated:
+        if not item.condition.strength:
+            unshifted.setdefault(replace(item.condition, axis=""), item)
+    shown = plain or list(unshifted.values()) or evaluated
     return [item for item in shown if item.condition.is_held_out] or shown
 
 

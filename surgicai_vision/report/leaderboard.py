@@ -185,6 +185,8 @@ def read_row(path: Path) -> Row:
             raise BadFile(f"{path} is not a row of format {FORMAT}.")
         json.dumps(table, ensure_ascii=False).encode()  # a ValueError if no page can show it
         return from_mapping(Row, table, str(path))
+    except BadFile:
+        raise
     except (OSError, ValueError, TypeError, RecursionError, InputError) as error:
         told = " ".join(str(error).split())[:200]
         raise BadFile(f"{path} cannot be read ({told}).") from None

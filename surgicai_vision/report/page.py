@@ -28,6 +28,8 @@ from surgicai_vision.report.retention import looks, retentions
 
 FEW = 12
 """Most other policies that the text below the headline lists."""
+CHOSEN = "is the best of several and was chosen after the fact, so its interval is optimistic."
+"""What is said of a policy that is named because it did best."""
 
 
 def render(page: dict[str, object]) -> str:
@@ -126,6 +128,8 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
         if shown.successes or not shown.condition.trained
         else f"The best: {first}"
     )
+    if shown.successes and sum(item.condition.trained for item in evaluated) > 1:
+        lead += f" It {CHOSEN}"
     others = [
         f"{item.label} {item.successes}/{item.episodes}" for item in evaluated if item is not shown
     ]
@@ -138,7 +142,7 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
 def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str]:
     """Return the best of each task.
 
-    The best of many is chosen after the fact, and the page says so.
+    The best of several is chosen after the fact, and the page says so.
     """
     best = [
         found for task in tasks if (found := best_trained(of_task(evaluated, task, plain=False)))
@@ -164,13 +168,14 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
         f" ({percentages.interval(item.interval)}; {item.label})"
         for item in best
     ]
-    warning = (
-        "Each is the best of several and was chosen after the fact, so its interval is optimistic."
-    )
+    trained = [item.condition.task for item in evaluated if item.condition.trained]
+    chosen = [item.condition.task for item in best if trained.count(item.condition.task) > 1]
+    which = "Each" if len(chosen) == len(best) else f"That of {' and '.join(chosen)}"
+    warning = f" {which} {CHOSEN}" if chosen else ""
     whose = f"each of {len(best)} tasks" if len(best) > 1 else best[0].condition.task
     return {
         "headline": f"The best trained policy of {whose} solves {span} of its {starts_of(best)}",
-        "lead": f"{'; '.join(parts)}. {warning}",
+        "lead": f"{'; '.join(parts)}.{warning}",
     }
 
 

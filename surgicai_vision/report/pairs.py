@@ -116,6 +116,7 @@ def factor(first: Condition, second: Condition) -> str:
         (not differ.isdisjoint(AMOUNTS) and _alike_otherwise(first, second), ("changes",)),
         ("name" in differ, OF_CONDITIONS),
         (any(are_blind), ("pool", "views")),  # without an encoder, nothing is pooled
+        (differ != {"place"}, ("place",)),  # where one was measured twice is no difference
     )
     differ -= {name for holds, names in belongs if holds for name in names}
     if len(differ) != 1:

@@ -1,6 +1,7 @@
 """Comparison with the paper: which of our conditions goes with which number of its Table 2."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from surgicai_vision.core import percentages
 from surgicai_vision.core.tasks import task_names
@@ -20,12 +21,18 @@ def beside_paper(
 
     The paper's encoders come first in each task, then those that only we have. Rates are None where
     the paper has none. The list is empty if we have none of the paper's pretrained encoders. Of
-    several numbers of demonstrations, the one nearest to the paper's is used.
+    several numbers of demonstrations, the one nearest to the paper's is used, and of several
+    evaluations the one with most episodes.
     """
     known = [item for item in groups if _comparable(item.condition)]
     if not any(item.condition.encoder in _TELLING for item in known):
         return []
-    known.sort(key=lambda item: -abs((item.condition.demonstrations or 0) - _DEMONSTRATIONS))
+    known.sort(
+        key=lambda item: (
+            -abs((item.condition.demonstrations or 0) - _DEMONSTRATIONS),
+            item.episodes,
+        )
+    )
     ours = {(c.task, c.encoder, c.view): item for item in known if (c := item.condition)}
     tasks = [task for task in task_names() if any(task == mine for mine, _, _ in ours)]
     others = sorted({encoder for _, encoder, _ in ours} - set(paper.ENCODERS))
@@ -73,5 +80,6 @@ def _comparable(condition: Condition) -> bool:
 
     It has one of the two views, and everything else is as usual.
     """
-    usual = condition.trained and condition.plain and not condition.variant
+    variant = replace(condition, place="").variant
+    usual = condition.trained and condition.plain and not variant
     return usual and len(condition.views) == 1 and condition.views[0] in paper.VIEWS

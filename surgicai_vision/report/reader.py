@@ -3,7 +3,6 @@
 A run's condition is everything about it except the training seed and the starts (`experiment_key`).
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -65,8 +64,8 @@ class Result:
         summary: its counts.
         about: how it was made.
         rows: its episodes.
-        place: where it is stored, if another evaluation of the same condition and training seed
-            is stored elsewhere.
+        place: where it is stored, below the folder that was read, if another evaluation of the
+            same condition and training seed is stored elsewhere.
     """
 
     folder: Path
@@ -262,15 +261,52 @@ def _outcomes(result: Result) -> set[tuple[int, bool, int]]:
 def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
     """Distinguish evaluations of the same condition and training seed by their folders.
 
-    Pooled, they would count twice.
+    Pooled, they would count twice. Other training seeds, strengths and axes of theirs that are
+    stored in such a folder belong to it too.
     """
-    count = Counter((result.condition, result.seed) for result in results)
+    alike: dict[tuple[Condition, int], list[Result]] = {}
+    for result in results:
+        alike.setdefault((result.condition, result.seed), []).append(result)
+    places: dict[Path, Path] = {}
+    of_policy: dict[Condition, set[Path]] = {}
+    for (condition, _), same in alike.items():
+        if len(same) > 1:
+            found = _places([result.folder.relative_to(folder) for result in same], condition)
+            places |= zip([result.folder for result in same], found, strict=True)
+            of_policy.setdefault(_unshifted(condition), set()).update(found)
+
+    def place_of(result: Result) -> Path:
+        if result.folder in places:
+            return places[result.folder]
+        path = result.folder.relative_to(folder)
+        others = of_policy.get(_unshifted(result.condition), ())
+        around = [place for place in others if path.is_relative_to(place)]
+        return max(around, key=lambda place: len(place.parts), default=Path())
+
+    found_places = [place_of(result) for result in results]
     return [
-        replace(result, place=str(result.folder.relative_to(folder)))
-        if count[result.condition, result.seed] > 1
-        else result
-        for result in results
+        replace(result, place=str(place)) if place.parts else result
+        for result, place in zip(results, found_places, strict=True)
     ]
+
+
+def _places(folders: Sequence[Path], condition: Condition) -> list[Path]:
+    """Return in what the folders of one condition differ: without what they all end in.
+
+    `robustness` stores a curve as `<axis>/<strength>`, which is left out as well, as long as the
+    places then still differ.
+    """
+    parts = [folder.parts for folder in folders]
+    while all(parts) and len({each[-1] for each in parts}) == 1:
+        parts = [each[:-1] for each in parts]
+    of_curve = (condition.axis, f"{condition.strength:g}")
+    curves = [each[:-2] if each[-2:] == of_curve else each for each in parts]
+    return [Path(*each) for each in (curves if len(set(curves)) == len(curves) else parts)]
+
+
+def _unshifted(condition: Condition) -> Condition:
+    """Return what all curves of a policy have in common."""
+    return replace(condition, axis="", strength=0.0)
 
 
 def read_probes(folder: Path) -> list[dict[str, Any]]:

@@ -258,17 +258,19 @@ def _curves(rows: Sequence[Row], tasks: Sequence[str]) -> list[Chart]:
 def _points(curves: Sequence[Sequence[CurvePoint]], x: Axis) -> tuple[Point, ...]:
     """Return the evaluations of all seeds, the n-th of each pooled.
 
-    A seed that has ended counts with its last one, at the x of the others. What does not move along
+    A seed that has ended counts with its last one, at the x of the others, but never before an
+    earlier point: slow seeds that end first must not turn the line back. What does not move along
     the axis is not a curve and has no points: a single evaluation, or offline learning against
     control steps.
     """
-    found = []
+    found: list[Point] = []
     for index in range(max(map(len, curves), default=0)):
         here = [curve[min(index, len(curve) - 1)] for curve in curves if curve]
         won = sum(point.successes for point in here)
         of = sum(point.episodes for point in here)
         bounds = statistics.clopper_pearson(won, of)
         where = float(np.mean([x(curve[index]) for curve in curves if index < len(curve)]))
+        where = max(where, found[-1].x) if found else where
         words = f"{won}/{of} ({percentages.interval(bounds)}) at {where:.3g}"
         found.append(Point(where, won / of, *bounds, words))
     return tuple(found) if len({point.x for point in found}) > 1 else ()

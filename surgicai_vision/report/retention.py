@@ -114,7 +114,7 @@ def _chart(task: str, label: str, rows: list[Kept]) -> Chart:
     bars = [
         Bar(row.axis.replace("_", " "), row.area or 0.0, _last(row), _words(row)) for row in rows
     ]
-    worst = next((row for row in rows if row.axis != ALL), rows[0])
+    worst = next((row for row in rows if row.axis != ALL and row.area is not None), None)
     title = f"{task}: {label}"
     return Chart(
         title,
@@ -122,7 +122,9 @@ def _chart(task: str, label: str, rows: list[Kept]) -> Chart:
         Markup(""),
         ("axis", "area under retention", "plain", "at strength", "shifted", "kept there"),
         tuple(_row(row) for row in rows),
-        f"Worst single axis: {worst.axis.replace('_', ' ')}, {_share(worst.area)} kept on average.",
+        f"Worst single axis: {worst.axis.replace('_', ' ')}, {_share(worst.area)} kept on average."
+        if worst
+        else "There is no plain success of which a share could be kept.",
     )
 
 

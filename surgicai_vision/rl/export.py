@@ -43,6 +43,7 @@ from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.files import write_bytes, write_json
 from surgicai_vision.core.tasks import env_id
+from surgicai_vision.envs.base import most_actions
 from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.rl.extra import check_extra
 from surgicai_vision.rl.transitions import OBSERVATION, Transitions, write_transitions
@@ -228,7 +229,7 @@ def spec_of(transitions: Transitions) -> EnvSpec:
     options = to_mapping(transitions.config)
     del options["task"], options["max_steps"]
     spec.kwargs.update(options, obs_type=transitions.obs_type)
-    spec.max_episode_steps = transitions.config.max_steps
+    spec.max_episode_steps = most_actions(transitions.config)
     return spec
 
 

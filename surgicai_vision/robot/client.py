@@ -248,7 +248,7 @@ class Client:
                 answered, _, problem = heard.message.text.partition(" ")
                 if answered == str(stamp):
                     if problem:
-                        raise InputError(f"the served simulation refused: {problem}.")
+                        raise InputError(f"the served simulation refused: {problem.rstrip('.')}.")
                     self._wait_for(heard.message.header.stamp, ends)
                     return heard.message.header.stamp
             self._transport.wait(POLL_S)

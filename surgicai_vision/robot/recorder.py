@@ -3,7 +3,8 @@
 An episode lasts from a reset to the judge's success. It has whole states and actions like any other
 (`demos.store`), and `render-demos` accepts it. An action is the motion of the active arm's set
 point within a control step, in units of the step preset. What a client commands beyond that is
-clipped, and these steps are counted. What is done to the other arm is in the states only.
+clipped, and these steps are counted. What is done to the other arm is in the states only. Episodes
+from starts that are reserved for validation or tests are not recorded (`core.banks`).
 """
 
 import math
@@ -13,6 +14,8 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.core import names
+from surgicai_vision.core.banks import TRAINING, USES, bank_of
 from surgicai_vision.core.files import code_version
 from surgicai_vision.demos.store import Demo
 from surgicai_vision.envs import poses
@@ -62,7 +65,13 @@ class Recorder:
 
     def begin(self) -> None:
         """Begin an episode, after a reset of the robot; a previous one not kept is dropped."""
-        self._is_on = True
+        bank = bank_of(self._robot.seed)
+        self._is_on = bank == TRAINING
+        if not self._is_on:
+            self._tell(
+                f"start {self._robot.seed} is not kept: it is in {USES[bank]}; request a seed "
+                f"below {names.VALIDATION_SEED}"
+            )
         self._clipped = 0
         self._states = [self._robot.env.get_state()]
         self._actions: list[NDArray[np.float64]] = []

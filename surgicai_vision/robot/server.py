@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Self, final
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, PhysicsError, check_name
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.robot import topics
 from surgicai_vision.robot.arm import (
@@ -290,7 +290,7 @@ class Server:
         """Do what a request says and answer it."""
         try:
             act(request.text)
-        except InputError as error:
+        except (InputError, PhysicsError) as error:
             self._answer(request, str(error))
         else:
             self._answer(request, "")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import final
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, PhysicsError, check_name
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.control import JAW_OPEN, Command
 from surgicai_vision.envs.success import Info
@@ -30,7 +30,8 @@ class SimulatedRobot:
         env: the env, of obs_type "state".
 
     Raises:
-        InputError: the env delays actions; a robot's delay is that of its messages.
+        InputError: the env delays, holds or changes actions; a robot obeys each command as it is,
+            and its delay is that of its messages.
     """
 
     def __init__(self, env: SuturingEnv):
@@ -38,6 +39,12 @@ class SimulatedRobot:
             raise InputError(
                 "randomisation.latency delays an env's actions; served commands are not delayed. "
                 "Leave it out."
+            )
+        if env.config.action_repeat != 1 or env.config.hold_jaw:
+            given = "hold_jaw" if env.config.hold_jaw else "action_repeat"
+            raise InputError(
+                f"env: {given} changes an env's actions; served commands are obeyed at every "
+                "control step, as they are. Leave it out."
             )
         self.env = env
         self.instrument = env.scene.config.instrument
@@ -58,8 +65,17 @@ class SimulatedRobot:
         return self.env.simulation.bases[PSM_NAMES[name]]
 
     def reset(self, seed: int) -> None:
-        """Begin the episode of `seed`."""
-        _, self.info = self.env.reset(seed=seed)
+        """Begin the episode of `seed`.
+
+        Raises:
+            PhysicsError: the seed has no start; nothing has changed.
+        """
+        before = self.env.get_state()
+        try:
+            _, self.info = self.env.reset(seed=seed)
+        except PhysicsError:
+            self.env.set_state_vector(before)
+            raise
         self.seed = seed
         self.steps = 0
 

@@ -34,6 +34,8 @@ FORMAT = 2
 CARD = "checkpoint.json"
 REQUEST = "training.json"
 """Marks the folder of a training that has begun; written first."""
+LOCK = ".lock"
+"""File in that folder that a training keeps locked; a killed one leaves it."""
 WEIGHTS = "policy.safetensors"
 PREPROCESSING = ("input_size", "input_range", "mean", "std", "interpolation", "channel_order")
 """Entries of a card that change what the network sees."""

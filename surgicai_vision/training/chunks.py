@@ -48,13 +48,13 @@ class Timeline:
     step: NDArray[np.int64]
 
 
-def timeline_of(dataset: Dataset, demos: Path | None = None) -> Timeline:
+def timeline_of(dataset: Dataset, demos: Sequence[Path] = ()) -> Timeline:
     """Return the timeline of a dataset, or of the whole dataset that it was selected from.
 
     Args:
         dataset: any dataset.
-        demos: the folder of its demonstrations, for one that was rendered with fewer frames; by
-            default the folder next to it, as in a sweep.
+        demos: the folders of its demonstrations, in the order in which they were rendered, for one
+            that was rendered with fewer frames; by default the folder next to it, as in a sweep.
 
     Raises:
         InputError: frames were left out, and the demonstrations are missing or different ones.
@@ -67,24 +67,26 @@ def timeline_of(dataset: Dataset, demos: Path | None = None) -> Timeline:
         runs = _runs(index, np.zeros(len(index)) if phase is None else np.asarray(phase))
         action = np.asarray(columns[names.ACTION], np.float32)
         return Timeline(action, *runs, np.arange(root.length))
-    return _from_demos(root, demos or root.path.parent / BESIDE)
+    return _from_demos(root, demos or [root.path.parent / BESIDE])
 
 
-def _from_demos(dataset: Dataset, folder: Path) -> Timeline:
-    """Return the timeline of a dataset whose demonstrations lie in `folder`."""
+def _from_demos(dataset: Dataset, folders: Sequence[Path]) -> Timeline:
+    """Return the timeline of a dataset whose demonstrations lie in `folders`."""
     need = (
         f"{dataset.path} holds {dataset.fps} frames per second, and a policy that plans chunks "
         f"learns from the action of every step, {dataset.config.steps_per_second} per second"
     )
     try:
-        paths = list_demos(folder)
+        paths = [path for folder in folders for path in list_demos(folder)]
     except (BadFile, InputError) as error:
         raise InputError(f"{need}; name its demonstrations with --demos DIR ({error})") from None
     if not isinstance(dataset, RenderedDataset) or (
         demos_digest(paths) != dataset.meta["demos_digest"]
     ):
+        given = ", ".join(map(str, folders))
         raise InputError(
-            f"{need}; {folder} holds other demonstrations. Give the dataset's own with --demos."
+            f"{need}; {given}: other demonstrations than the dataset's. Give all of its own with "
+            "--demos DIR[,DIR], in the order in which they were rendered."
         )
     shown = [read_demo(path) for path in paths]
     lengths = np.array([len(demo) for demo in shown])

@@ -1,12 +1,15 @@
 """The folder of a training: its request, and the state from which it resumes.
 
-    if done := begin(out, request):    # refuses another training's folder
+    if done := finished(out, request):    # refuses another training's folder
         return done
-    …
-    write_state(out, state)            # periodically; a kill loses only what came since
-    state = read_state(out)            # None if there is no complete one
-    …
-    remove_state(out)                  # the checkpoint is written
+    with claimed(out):                    # and another process in it
+        if done := begin(out, request):
+            return done
+        …
+        write_state(out, state)           # periodically; a kill loses only what came since
+        state = read_state(out)           # None if there is no complete one
+        …
+        remove_state(out)                 # the checkpoint is written
 
 A state is plain data and tensors; reading it runs no code. Its file begins with the sha256 of what
 follows, so a file that is damaged or was written by something else is not a complete state.
@@ -14,46 +17,82 @@ follows, so a file that is damaged or was written by something else is not a com
 
 import hashlib
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from surgicai_vision.core.errors import OutputExists
+from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.files import (
     check_output,
+    locked,
     read_json,
     remove_partial,
     write_bytes,
     write_json,
 )
-from surgicai_vision.training.checkpoint import CARD, REQUEST, Checkpoint, read_checkpoint
+from surgicai_vision.training.checkpoint import (
+    CARD,
+    LOCK,
+    REQUEST,
+    WEIGHTS,
+    Checkpoint,
+    read_checkpoint,
+)
 
 STATE = "training_state.pt"
 DIGEST_BYTES = hashlib.sha256().digest_size
 
 
-def begin(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
-    """Make a training's folder, or reuse one of the same request; return a finished checkpoint.
+def finished(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
+    """Return the checkpoint of a finished training; None if there is something left to train.
 
     Args:
         out: the checkpoint folder.
         request: everything that decides the result, as plain data.
 
-    Returns:
-        The checkpoint of a finished training; None if there is something left to train.
-
     Raises:
         OutputExists: `out` holds something else.
     """
-    check_output(out, may_resume=REQUEST)
+    check_output(out, may_resume=REQUEST, ours=(LOCK,))
     if (out / REQUEST).exists() and read_json(out / REQUEST) != request:
         raise OutputExists(
             f"--out {out} holds another training; give a folder that does not exist yet."
         )
-    if (out / CARD).exists():
-        return read_checkpoint(out)
+    if not (out / CARD).exists():
+        return None
+    checkpoint = read_checkpoint(out)
+    with suppress(OSError):  # left by a process that was killed after its last write
+        remove_state(out)
+    return checkpoint
+
+
+@contextmanager
+def claimed(out: Path) -> Iterator[None]:
+    """Hold a training's folder exclusively, and clear what a killed training left unfinished in it.
+
+    Raises:
+        InputError: another process holds it.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    refusal = InputError(
+        f"Another run is training into {out}; wait for it, stop it or give another --out."
+    )
+    with locked(out / LOCK, refusal=refusal):
+        for folder in (out, *out.glob("epochs/*")):
+            remove_partial(folder, (REQUEST, STATE, WEIGHTS, CARD))
+        yield
+
+
+def begin(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
+    """Make a training's folder, or reuse one of the same request.
+
+    Returns and raises as `finished`.
+    """
+    if done := finished(out, request):
+        return done
     out.mkdir(parents=True, exist_ok=True)
     if not (out / REQUEST).exists():
         remove_partial(out, (REQUEST,))

@@ -91,13 +91,15 @@ def policy_names() -> tuple[str, ...]:
 def policy_plugin(name: str) -> "Plugin":
     """Import the policy plug-in of `name`; `UnknownName` lists what exists.
 
-    What a plug-in from another distribution builds is checked: it must be a `Policy` that returns
+    A plug-in from another distribution has this name whatever its author calls it, since a
+    checkpoint names its policy by it. What it builds is checked: it must be a `Policy` that returns
     actions.
     """
     plugin = POLICIES.load(name)
     if POLICIES.is_ours(name):
         return plugin
-    return dataclasses.replace(plugin, make=functools.partial(_made, name, plugin))
+    make = functools.partial(_made, name, plugin)
+    return dataclasses.replace(plugin, name=name, make=make)
 
 
 def _made(

@@ -35,7 +35,7 @@ from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
 from surgicai_vision.features.devices import cuda_devices
 from surgicai_vision.training.checkpoint import Checkpoint
-from surgicai_vision.training.folder import begin, remove_state
+from surgicai_vision.training.folder import begin, claimed, finished, remove_state
 from surgicai_vision.training.loop import Log, Training
 from surgicai_vision.training.request import TrainingRequest, check_request, request_table
 from surgicai_vision.training.run_config import RunConfig
@@ -82,7 +82,8 @@ def train(
         log: called with (epoch, losses by name) after each epoch.
 
     Raises:
-        InputError: features of another dataset or of several encoders, or nothing to train on.
+        InputError: features of another dataset or of several encoders, nothing to train on, or
+            another process that trains into `out`.
         OutputExists: `out` holds something else.
         SurgicaiError: the loss is not finite.
     """
@@ -90,13 +91,17 @@ def train(
     request = TrainingRequest(dataset, tuple(features), policy, recipe, seed, run, progress_policy)
     out = Path(out)
     check_request(request)
-    if done := begin(out, request_table(request, start)):
+    table = request_table(request, start)
+    if done := finished(out, table):
         return done
-    _keep_memory()
-    where = torch.device(device)
-    with _repeatable(where):
-        checkpoint = Training(request, start, where).run(out, save_every, progress, log)
-    remove_state(out)
+    with claimed(out):
+        if done := begin(out, table):  # another process has finished it meanwhile
+            return done
+        _keep_memory()
+        where = torch.device(device)
+        with _repeatable(where):
+            checkpoint = Training(request, start, where).run(out, save_every, progress, log)
+        remove_state(out)
     return checkpoint
 
 

@@ -88,6 +88,22 @@ def test_a_killed_evaluation_is_made_again_by_the_same_command(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--task", "grasp"], "does the whole procedure"),
+        (["--dataset", "set"], "only for replay"),
+        (["--video-of", "failures"], "goes with --video"),
+    ],
+)
+def test_swapping_every_subtask_refuses_what_it_would_ignore(tmp_path, capsys, options, told):
+    out = tmp_path / "out"
+    command = ["evaluate", "hierarchical.yaml", "--expert-swap", "all", "--out", str(out)]
+    assert main([*command, *options]) == 2
+    assert told in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
     "command",
     [
         ["scene", "--looks", "figure.png", "--appearance", "plain"],

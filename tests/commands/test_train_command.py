@@ -76,6 +76,17 @@ def test_imitation_takes_the_first_demonstrations_it_is_told_to(tmp_path, capsys
     assert counts == [1, 2]
     assert main([*given, "--demonstrations", "3", "--out", "more"]) == 2
     assert "holds 2" in capsys.readouterr().err and not (tmp_path / "more").exists()
+    assert main([*given, "--demos", "demos", "--out", "unread"]) == 2
+    assert "'bc' learns from the frames of the dataset" in capsys.readouterr().err
+
+    given = ["train", "--algo", "bc", "--demos", "demos"]
+    assert main([*given, "--demonstrations", "3"]) == 2
+    assert "3 demonstrations were requested; demos holds 2" in capsys.readouterr().err
+    assert main(["train", "--algo", "bc", "--demos", "demos,dataset"]) == 2
+    assert "one folder of demonstrations; --demos names 2" in capsys.readouterr().err
+    assert main(["export-demos", "--demos", "demos", "--episodes", "3"]) == 2
+    assert "3 demonstrations were requested; demos holds 2" in capsys.readouterr().err
+    assert not (tmp_path / "outputs").exists()
 
 
 def test_a_checkpoint_is_named_by_the_task_of_its_data(tmp_path, capsys):

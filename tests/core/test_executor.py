@@ -298,6 +298,28 @@ def test_an_error_of_another_distributions_engine_says_whose_it_is(monkeypatch):
         ENGINES.unregister("broken")
 
 
+@dataclass(frozen=True)
+class Silent(Engine):
+    """An engine that drops what `perform` returns, and forgets its last task."""
+
+    name: ClassVar[str] = "silent"
+
+    def execute(self, tasks, workers, attempts=None):
+        for key, task in list(tasks.items())[:-1]:
+            task.do()
+            yield key, None
+
+
+def test_a_result_that_an_engine_has_not_made_is_an_error(tmp_path):
+    jobs = [*squares([2]), Job("crash", {}), *squares([3])]
+    told = []
+    run(jobs, tmp_path, RunContext(1, Silent()), ended=lambda job, _, error: told.append(error))
+    assert told[0] is None
+    assert [type(error) for error in told[1:]] == [SurgicaiError, SurgicaiError]
+    with pytest.raises(SurgicaiError, match=r"^The executor 'silent' has done crash\(\), but /"):
+        run(jobs, tmp_path, RunContext(1, Silent()))
+
+
 def test_a_folder_that_another_run_has_made_is_found_before_the_work(tmp_path):
     out = tmp_path / "out"
     out.mkdir()

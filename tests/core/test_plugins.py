@@ -63,6 +63,8 @@ def test_a_registered_part_stands_beside_ours() -> None:
     assert registry.names() == ("pi", "answer")
     with pytest.raises(NameCollision, match=r"'pi'.*'surgicai-vision'.*'mine'"):
         registry.register("pi", 3.0, distribution="mine")
+    with pytest.raises(NameCollision, match=r"'answer' is offered twice by 'mine'; .*Python anew"):
+        registry.register("answer", 43.0, distribution="mine")
 
 
 def test_entry_points_of_installed_distributions_are_read(site: Path) -> None:

@@ -1,15 +1,19 @@
 """YAML files from users: every reader refuses the same files, with one-line errors."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, cast
 
 import pytest
 
 from policies.base import Recipe
+from policies.chunks import ChunkRecipe
 from surgicai_vision.commands.sweep import read_experiment
-from surgicai_vision.core.config import TaskConfig, from_mapping, read_changes
+from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, read_changes
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_yaml
+from surgicai_vision.core.yaml_text import load_yaml
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.experiments.plan_config import read_plan
 from surgicai_vision.training.policies import load_recipe
@@ -62,6 +66,56 @@ def test_aliases_and_merges_keep_their_meaning(tmp_path):
     table = {"b": 1, "c": 2}
     merged = {"d": {**table, "c": 3}, "e": {**table, "c": 4}}
     assert read_yaml(path) == {"a": table, **merged, "f": [table, table]}
+
+
+@dataclass(frozen=True)
+class Theirs:
+    """Types that a recipe or an engine of another distribution may have."""
+
+    kind: Literal["soft", "hard"] = "soft"
+    width: int | str | None = "auto"
+    widths: list[int] = field(default_factory=list)
+    pair: tuple[int, str] = (1, "a")
+    table: dict[str, JSON] = field(default_factory=dict)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("kind: loud", "'loud' is unknown; allowed: 'soft', 'hard'"),
+        ("width: 1.5", "expected str, got 1.5"),
+        ("widths: 7", "expected a list, got 7"),
+        ("widths: [1, a]", "expected int, got 'a'"),
+        ("pair: [a, 1]", "expected int, got 'a'"),
+        ("pair: [1]", "expected 2 values, got 1"),
+        ("table: {a: 1, 2: b}", "the key 2 is not text"),
+    ],
+)
+def test_a_value_of_another_type_is_refused(text: str, told: str) -> None:
+    with pytest.raises(InputError, match=f"^theirs: .*{told}"):
+        from_mapping(Theirs, cast(dict[str, object], load_yaml(text)), "theirs")
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("kind: hard", "hard"),
+        ("width: 3", 3),
+        ("width: wide", "wide"),
+        ("width: ~", None),
+        ("widths: [1, 2]", [1, 2]),
+        ("pair: [2, b]", (2, "b")),
+    ],
+)
+def test_each_type_takes_its_values(text: str, value: object) -> None:
+    given = from_mapping(Theirs, cast(dict[str, object], load_yaml(text)))
+    assert getattr(given, text.partition(":")[0]) == value
+
+
+def test_a_setting_with_keys_of_two_types_is_refused() -> None:
+    settings = cast(dict[str, JSON], load_yaml("a: {1: 2, b: 3}"))
+    with pytest.raises(InputError, match="settings: a is"):
+        ChunkRecipe(settings=settings)
 
 
 @pytest.mark.parametrize(

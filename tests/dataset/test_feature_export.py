@@ -1,12 +1,14 @@
 """Datasets with features instead of images: accepted folders, and what a kill leaves."""
 
+import multiprocessing
+import os
+
 import numpy as np
 import pytest
 
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import OutputExists
 from surgicai_vision.core.executor import RunContext
-from surgicai_vision.core.files import TEMPORARY
 from surgicai_vision.dataset import feature_export, open_dataset, render_demos
 from surgicai_vision.dataset.feature_export import export_features
 from surgicai_vision.demos.record import record
@@ -42,14 +44,15 @@ def test_an_export_is_not_what_was_rendered(dataset, tmp_path):
         render_demos(demos, tmp_path / "out", views=("back",), size=32, context=RunContext(0))
 
 
-def test_what_a_kill_leaves_is_named_as_everything_that_may_be_deleted(
-    dataset, tmp_path, monkeypatch
-):
-    found = []
+def test_an_export_that_was_killed_is_made_anew_and_leaves_nothing(dataset, tmp_path, monkeypatch):
+    rows = np.zeros((dataset.length, 2), np.float32)
+    given = (dataset, [rows], ABOUT, tmp_path / "out")
+    with monkeypatch.context() as killed:
+        killed.setattr(feature_export, "assemble", lambda *arguments: os._exit(9))
+        process = multiprocessing.get_context("fork").Process(target=export_features, args=given)
+        process.start()
+        process.join()
+    assert process.exitcode == 9 and list(tmp_path.iterdir())
 
-    def assemble(shards, *arguments):
-        found.extend(path.name for path in tmp_path.iterdir())
-
-    monkeypatch.setattr(feature_export, "assemble", assemble)
-    export_features(dataset, [np.zeros((dataset.length, 2), np.float32)], ABOUT, tmp_path / "out")
-    assert len(found) == 1 and found[0].startswith(TEMPORARY)
+    export_features(*given)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]

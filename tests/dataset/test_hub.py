@@ -167,3 +167,5 @@ def test_dry_run_shows_the_card(dataset, capsys):
     assert "license: mit" in capsys.readouterr().out
     assert main(["dataset", "push", str(dataset)]) == 2
     assert "--repo USER/NAME" in capsys.readouterr().err
+    assert main(["dataset", "push", str(dataset), "--repo", "../b", "--dry-run"]) == 2
+    assert "not a valid name on the Hub" in capsys.readouterr().err

@@ -1,7 +1,10 @@
 """Cutting whole procedures: a subtask's visits, as demonstrations of the subtask."""
 
 import dataclasses
+import functools
 import json
+import multiprocessing
+import os
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import DWELL, TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
 from surgicai_vision.dataset import open_dataset, render_demos
+from surgicai_vision.demos import cut
 from surgicai_vision.demos.cut import SHORTEST, cut_demos, visits
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.record import record
@@ -125,6 +129,23 @@ def test_a_finished_folder_is_left_as_it_is_and_another_request_refused(procedur
     assert {path: path.stat().st_mtime_ns for path in paths} == before
     with pytest.raises(OutputExists, match="another command"):
         cut_demos(procedures, "place", out=out)
+
+
+def test_what_a_killed_cut_left_is_removed(broken, tmp_path, monkeypatch):
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    write_demo(whole, 0, broken)
+    write_marker(whole, names.SUTURE, "expert")
+    call = functools.partial(cut_demos, whole, "grasp", out=tmp_path / "visits")
+    with monkeypatch.context() as killed:
+        killed.setattr(cut, "write_marker", lambda *arguments, **details: os._exit(9))
+        process = multiprocessing.get_context("fork").Process(target=call)
+        process.start()
+        process.join()
+    assert process.exitcode == 9 and not (tmp_path / "visits").exists()
+
+    assert len(call()) == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["visits", "whole"]
 
 
 def test_what_has_no_visits_is_refused(procedures, broken, tmp_path):

@@ -259,6 +259,8 @@ def test_held_actions_are_refused(demos: list[Demo], tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "dataset", [rows_of(demos[0], 0)])
     with pytest.raises(InputError, match="action_repeat is 5"):
         import_dataset(path, task="place", out=tmp_path / "out", env={"action_repeat": 5})
+    with pytest.raises(InputError, match="the task is a separate option"):
+        import_dataset(path, task=None, out=tmp_path / "out", env={"task": "place"})
     assert not (tmp_path / "out").exists()
 
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -173,6 +174,22 @@ def test_card_is_complete(name: str) -> None:
     # differ in units.
     middle = (sum(card.input_range) / 2 - np.array(card.mean)) / np.array(card.std)
     assert np.abs(middle).max() < 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"channel_order": "bgr"}, "Unknown channel_order 'bgr'. Allowed: BGR, RGB"),
+        ({"interpolation": "cubic"}, "Unknown interpolation 'cubic'. Did you mean 'bicubic'"),
+        ({"batch": 0}, "batch is 0; it must be at least 1"),
+        ({"input_size": 0}, "input_size is 0; it must be at least 1"),
+        ({"mean": (0.5,)}, r"mean is \(0.5,\), std .*each has three values"),
+        ({"std": (0.5, 0.5, 0.0)}, "std of B is 0.0; it must be above 0"),
+    ],
+)
+def test_a_card_that_no_image_fits_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=f"^{message}"):
+        replace(encoder_card("random"), **change)
 
 
 def test_r3m_takes_0_to_255_and_divides_itself() -> None:

@@ -1,5 +1,6 @@
 """Weights: where they are found, which files are refused, and every loader on a whole file."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -257,3 +258,30 @@ def test_files_that_would_run_code_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadFile, match="holds only weights"):
         load_encoder("r3m-18", weights=WeightsSource.of(tmp_path / "harm.bin"))
     assert not (tmp_path / "harm").exists()
+
+
+def test_a_source_that_is_no_repository_of_the_hub_is_not_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(weights, "hub_answers", lambda: False)
+    card = dataclasses.replace(encoder_card("r3m"), source="our lab's disk")
+    with pytest.raises(MissingWeights, match=r"pytorch_model\.bin .*our lab's disk"):
+        weights.find(card, None, True, ())
+    assert weights.find(dataclasses.replace(card, offline=True), None, True, ()) is None
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+@pytest.mark.parametrize("is_zip", [False, True])
+def test_a_torch_file_with_changed_bytes_is_read_or_refused(is_zip: bool, tmp_path: Path) -> None:
+    path = tmp_path / "weights.pt"
+    table = torch.nn.Linear(3, 2).state_dict()
+    torch.save({"model": table}, path, _use_new_zipfile_serialization=is_zip)
+    whole = path.read_bytes()
+    generator = np.random.default_rng(0)
+    for _ in range(300):
+        content = bytearray(whole)
+        for place in generator.integers(0, len(whole), 3):
+            content[place] = generator.integers(0, 256)
+        path.write_bytes(content)
+        with contextlib.suppress(BadFile):
+            read_torch(path)

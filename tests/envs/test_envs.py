@@ -264,6 +264,11 @@ def test_actions_beyond_the_box_are_clipped():
         ({"image_size": 224.0}, ("224.0", "height, width")),
         ({"cameras": "frnt"}, ("'frnt'", "'front'")),
         ({"render_mode": "ansi"}, ("human", "rgb_array")),
+        ({"hold_jaw": "False"}, ("hold_jaw", "bool", "'False'")),
+        ({"end_on_drop": 1}, ("end_on_drop", "bool", "1")),
+        ({"action_repeat": 1.5}, ("action_repeat", "int", "1.5")),
+        ({"max_steps": 2.5}, ("max_steps", "int", "2.5")),
+        ({"obs_type": "pixels", "depth": "no"}, ("depth", "'no'", "True or False")),
     ],
 )
 def test_wrong_arguments_are_refused_with_what_exists(argument, allowed):

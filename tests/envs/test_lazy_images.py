@@ -66,3 +66,25 @@ def test_an_env_that_was_put_elsewhere_has_moved_on(move: str) -> None:
     moves[move]()
     with pytest.raises(InputError, match="after the env has moved on"):
         observation["front"]
+
+
+def test_an_action_that_is_held_is_rendered_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At its end, or where the episode ends before it: nothing else is seen."""
+    env = make(TaskConfig("grasp", action_repeat=4, max_steps=6))
+    twin = make(TaskConfig("grasp", max_steps=6))
+    for each in (env, twin):
+        each.reset(seed=names.TEST_SEED)
+    rendered = []
+    render = env._images.frames
+    monkeypatch.setattr(
+        env._images, "frames", lambda view, *rest: rendered.append(view) or render(view, *rest)
+    )
+    action = np.full(7, 0.5, np.float32)
+    for steps in (4, 2):
+        observation, _, _, truncated, _ = env.step(action)
+        for _ in range(steps):
+            plain = twin.step(action)[0]
+        assert rendered == list(VIEWS) and truncated == (steps == 2)
+        for key, frame in plain.items():
+            np.testing.assert_array_equal(observation[key], frame)
+        rendered.clear()

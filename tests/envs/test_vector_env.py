@@ -89,13 +89,14 @@ def test_images_of_workers_are_those_of_single_envs(mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_lerobot_finds_its_attributes(mode):
-    vector = make_vec("grasp", mode, max_episode_steps=120)
+@pytest.mark.parametrize("held", [1, 2])
+def test_lerobot_finds_its_attributes(mode, held):
+    vector = make_vec("grasp", mode, max_episode_steps=120, action_repeat=held)
     try:
         assert vector.call("_max_episode_steps") == (120, 120)
         assert vector.call("task") == ("grasp", "grasp")
         assert vector.call("task_description") == (names.TASK_TEXTS["grasp"],) * 2
-        assert vector.metadata["render_fps"] == 50
+        assert vector.metadata["render_fps"] == 50 // held
     finally:
         vector.close()
 

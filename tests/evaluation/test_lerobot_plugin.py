@@ -202,6 +202,20 @@ def test_env_of_another_task_than_the_datasets_has_that_tasks_limit(dataset: Pat
     assert SurgicaiEnv(dataset=str(dataset), tasks=["suture", TASK]).max_steps == 1000
 
 
+def test_env_counts_control_steps_of_held_actions() -> None:
+    """As `evaluate` does: an episode is no longer because its actions are held."""
+    from lerobot_env_surgicai import SurgicaiEnv
+
+    held = SurgicaiEnv(task="place", action_repeat=2, max_steps=5, image_size=16)
+    env = held.create_envs(1)["surgicai"][0]
+    assert env.call("_max_episode_steps") == (3,)
+    env.reset(seed=[0])
+    ends = [bool(env.step(np.zeros((1, 7), np.float32))[3][0]) for _ in range(3)]
+    assert ends == [False, False, True]
+    env.close()
+    assert SurgicaiEnv(max_steps=0).gym_kwargs["max_episode_steps"] == 200
+
+
 def test_env_shows_what_the_dataset_holds_and_waits_after_its_end(dataset: Path) -> None:
     from lerobot.envs.factory import make_env, make_env_config
     from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation

@@ -303,6 +303,29 @@ def test_running_again_does_only_what_is_missing(tmp_path, pretend):
         curves.robustness(seeing_spec(), range(5), tmp_path, silent, ("light",))
 
 
+def test_the_table_has_every_axis_and_strength_that_was_ever_measured(tmp_path, pretend):
+    import pyarrow.parquet as pq
+
+    seeds = range(900_000, 900_005)
+    curves.robustness(seeing_spec(), seeds, tmp_path, silent, ("light",), (0.0, 1.0))
+    rows = curves.robustness(seeing_spec(), seeds, tmp_path, silent, ("blur",), (0.0, 1.0))
+    assert pretend.calls == [("light", 0.0), ("light", 1.0), ("blur", 1.0)]
+    stored = pq.read_table(tmp_path / CURVES).to_pylist()
+    assert [(row["axis"], row["strength"]) for row in stored] == [
+        ("blur", 0.0),
+        ("blur", 1.0),
+        ("light", 0.0),
+        ("light", 1.0),
+    ]
+    assert rows == stored[:2]
+    p = mcnemar([True] * 5, [False] * 4 + [True])
+    assert stored[1]["p_holm"] == min(1.0, 2 * p)
+    (_, middle, last) = curves.robustness(
+        seeing_spec(), seeds, tmp_path, silent, ("light",), (0.5,)
+    )
+    assert (middle["strength"], middle["p"] is None, last["strength"]) == (0.5, False, 1.0)
+
+
 def test_what_a_kill_left_beside_the_plain_evaluation_is_not_copied(tmp_path, pretend):
     seeds = range(900_000, 900_003)
     curves.robustness(seeing_spec(), seeds, tmp_path, silent, ("light",), (0.0, 1.0))

@@ -1,5 +1,6 @@
 """Plans with rounds of DAgger: a policy is trained, acts in further demonstrations, and so on."""
 
+import inspect
 from contextlib import contextmanager
 
 import pytest
@@ -9,9 +10,11 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker
+from surgicai_vision.experiments import prepare
 from surgicai_vision.experiments.plan_config import plan_of
 from surgicai_vision.experiments.sweep import driver
 from surgicai_vision.experiments.sweep.driver import run_sweep
+from surgicai_vision.experiments.sweep.jobs import train_policy
 from surgicai_vision.experiments.sweep.plan import Jobs, plan
 from surgicai_vision.report.experiment_key import condition_of
 from surgicai_vision.report.pairs import factor
@@ -79,6 +82,27 @@ def test_each_round_is_driven_by_the_policy_of_the_one_before_and_holds_its_demo
             assert learner.run.dagger_rounds == list(held).index(name) - 1
     all_seeds = [seeds(jobs.data_folder(f"seed0/{name}")) for name in held]
     assert not set.intersection(*all_seeds[:2]) and not set.intersection(*all_seeds[1:])
+
+
+def test_a_policy_is_told_every_folder_of_demonstrations_that_its_dataset_shows(
+    tiny, tmp_path, monkeypatch
+):
+    """One that plans chunks reads the actions of the frames that were not rendered there."""
+    rendered = {}
+    monkeypatch.setattr(prepare, "record", lambda *arguments, **options: None)
+    monkeypatch.setattr(
+        prepare, "render_demos", lambda demos, out, **options: rendered.update({out: list(demos)})
+    )
+    jobs = Jobs(tiny, tmp_path)
+    for run in tiny.runs:
+        for part in tiny.parts(run).values():
+            folder = jobs.data_folder(part.dataset)
+            prepare.make_dataset(tiny.datasets[part.dataset], folder, RunContext(0))
+            job = jobs.policy(part)
+            assert job.arguments["demos"] == [str(path) for path in rendered[folder / "dataset"]]
+            inspect.signature(train_policy).bind(folder, **job.arguments)
+    counts = [len(folders) for folders in rendered.values()]
+    assert counts == [3, 1]
 
 
 def test_a_learner_is_counted_where_a_condition_names_it(swept, tiny):

@@ -239,3 +239,13 @@ def test_an_encoder_that_cannot_be_used_is_named(change: dict[str, Any], message
             encoders.load_encoder("odd", device="cpu")
     finally:
         encoders.ENCODERS.unregister("odd")
+
+
+@pytest.mark.parametrize("build", [TINY.build, lambda _, path: TINY.build(TINY.card, path)])
+def test_an_encoder_has_the_name_it_is_offered_under(build: Any) -> None:
+    encoders.register_encoder("odd", replace(TINY, build=build), "theirs")
+    try:
+        card = encoders.load_encoder("odd", device="cpu").card
+        assert (encoders.encoder_card("odd").name, card.name) == ("odd", "odd")
+    finally:
+        encoders.ENCODERS.unregister("odd")

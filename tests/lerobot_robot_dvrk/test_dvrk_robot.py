@@ -342,7 +342,11 @@ def test_ways_that_there_are_not_are_refused(leader, problem):
     ("action", "problem"),
     [
         ({"dx.vel": math.nan}, "not seven finite numbers"),
-        ({"x.pos": 0.1, "y.pos": 0.2}, ""),  # what LeRobot sends to return to the first pose
+        # What LeRobot sends to return to the first pose.
+        ({"x.pos": 0.1, "y.pos": 0.2}, "has x.pos, y.pos, but --robot.action=increments takes dx"),
+        # A gamepad of LeRobot's, without --robot.action=delta.
+        ({"delta_x": 1.0, "gripper": 2.0}, "has delta_x, gripper, but --robot.action=increments"),
+        ({}, ""),
     ],
 )
 def test_an_action_that_says_nothing_usable_holds_the_arm(robot, action, problem, caplog):

@@ -165,6 +165,13 @@ def test_a_seed_that_has_ended_counts_with_its_last_evaluation():
     assert points[-1].text.startswith("15/40") and points[-1].text.endswith("at 4")
 
 
+def test_a_slow_seed_that_ends_first_does_not_turn_the_line_back():
+    slow = [CurvePoint(1000 * at, 0, 2.0 * at, 10, 20) for at in range(1, 4)]
+    fast = [CurvePoint(1000 * at, 0, 1.0 * at, 10, 20) for at in range(1, 7)]
+    places = [point.x for point in _points([slow, fast], lambda point: point.minutes)]
+    assert places == [1.5, 3.0, 4.5, 4.5, 5.0, 6.0]
+
+
 def test_an_algorithm_has_one_colour_and_what_all_share_is_said_once(folder):
     groups = [item for item in group(collect(folder)) if item.condition.trained_by != "bc"]
     lost = ("td3", "grasp")  # the first algorithm has no result on the first task

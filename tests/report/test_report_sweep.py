@@ -595,6 +595,67 @@ def test_one_task_with_a_trained_policy_is_named(tmp_path):
     assert told["headline"].startswith("The best trained policy of grasp solves")
 
 
+def test_only_a_policy_that_was_chosen_among_several_is_called_the_best_of_them(tmp_path):
+    generator = np.random.default_rng(0)
+    for task in ("grasp", "place"):
+        evaluation(tmp_path / task, run_of(task, "imagenet", ("back",), 0), 0.9, generator)
+    told = page.headline(group(collect(tmp_path)))
+    assert "optimistic" not in told["lead"]
+    evaluation(tmp_path / "other", run_of("place", "random", ("back",), 0), 0.9, generator)
+    told = page.headline(group(collect(tmp_path)))
+    assert "That of place is the best of several" in told["lead"]
+    of_place = [item for item in group(collect(tmp_path)) if item.condition.task == "place"]
+    assert "It is the best of several" in page.headline(of_place)["lead"]
+    assert "optimistic" not in page.headline(of_place[:1])["lead"]
+
+
+def test_the_copies_of_a_plain_evaluation_are_one_policy(tmp_path):
+    generator = np.random.default_rng(0)
+    for axis, strength in itertools.product(("blur", "light"), (0.0, 1.0)):
+        run = run_of("grasp", "imagenet", ("back",), 0, shift=Shift(axis, strength))
+        evaluation(tmp_path / axis / f"{strength:g}", run, 0.9, generator)
+    lead = page.headline(group(collect(tmp_path)))["lead"]
+    assert "For comparison" not in lead and "best of several" not in lead
+
+
+def test_a_policy_that_was_measured_twice_is_compared_with_others(tmp_path):
+    generator = np.random.default_rng(0)
+    for place, encoder, rate, count in (
+        ("few", "imagenet", 1.5, 10),
+        ("many", "imagenet", 1.5, 20),
+        ("other", "random", -0.5, 20),
+    ):
+        run = run_of("grasp", encoder, ("back",), 0)
+        evaluation(tmp_path / place, run, rate, generator, episodes=count)
+    groups = group(collect(tmp_path))
+    pairs = [(pair.factor, pair.episodes) for pair in compare(groups)]
+    assert sorted(pairs) == [("encoder", 10), ("encoder", 20), ("place", 10)]
+    beside = {row[1]: row[2] for row in paper_comparison.beside_paper(groups)}
+    _, (_, shown) = beside["imagenet"]
+    assert shown is not None and shown.episodes == 20
+
+
+@pytest.mark.parametrize(("counts", "told"), [((4, 4), "by seed 4, 4"), ((4, 2), "4/4, 2/2")])
+def test_seeds_with_other_numbers_of_episodes_say_of_how_many(tmp_path, counts, told):
+    generator = np.random.default_rng(0)
+    for seed, count in enumerate(counts):
+        run = run_of("grasp", "imagenet", ("back",), seed)
+        evaluation(tmp_path / str(seed), run, 5.0, generator, episodes=count)
+    (item,) = group(collect(tmp_path))
+    assert item.across_text().endswith(told)
+
+
+def test_training_seeds_of_two_sweeps_stay_together(tmp_path):
+    generator = np.random.default_rng(0)
+    for sweep, seeds in (("first", (0, 1, 2)), ("second", (0, 1))):
+        for seed in seeds:
+            run = run_of("grasp", "imagenet", ("back",), seed)
+            evaluation(tmp_path / sweep / "runs" / f"k{seed}" / "evaluation", run, 0.5, generator)
+    groups = group(collect(tmp_path))
+    found = {item.condition.place: [result.seed for result in item.results] for item in groups}
+    assert found == {"first": [0, 1, 2], "second": [0, 1]}
+
+
 def test_a_probe_counts_each_held_out_start_once(tmp_path):
     generator = np.random.default_rng(0)
     run = run_of("grasp", "imagenet", ("back",), 0)

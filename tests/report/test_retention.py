@@ -76,6 +76,34 @@ def test_curves_that_were_measured_twice_are_drawn_twice(tmp_path):
     ]
 
 
+def test_a_curve_stays_whole_if_only_some_of_it_was_measured_twice(tmp_path):
+    generator = np.random.default_rng(5)
+    measured = [("a", "light", 0.0), ("a", "light", 0.5)]
+    measured += itertools.product("b", ("light", "blur"), (0.0, 0.5, 1.0))
+    for out, axis, strength in measured:
+        run = run_of("grasp", "imagenet", ("back",), 0, shift=Shift(axis, strength))
+        place = tmp_path / out / axis / f"{strength:g}"
+        evaluation(place, run, 0.9 - 0.5 * strength, generator, {"checkpoint": CHECKPOINT})
+    groups = group(collect(tmp_path))
+    charts = {chart.title: chart.rows for chart in robustness_curves(groups)}
+    rows = {row[0]: row for row in charts["grasp: light"]}
+    assert set(rows) == {"imagenet · a on back", "imagenet · b on back"}
+    assert rows["imagenet · a on back"][3] == "–"  # it has no strength 1
+    assert "–" not in rows["imagenet · b on back"]
+    (chart,) = retentions(groups)
+    assert (chart.title, len(chart.rows)) == ("grasp: imagenet · b on back", 2)
+
+
+def test_what_never_succeeds_plainly_has_no_worst_axis(tmp_path):
+    generator = np.random.default_rng(5)
+    for axis, strength in itertools.product(("light", "blur"), (0.0, 1.0)):
+        run = run_of("grasp", "imagenet", ("back",), 0, shift=Shift(axis, strength))
+        evaluation(tmp_path / axis / f"{strength:g}", run, -5.0, generator)
+    (chart,) = retentions(group(collect(tmp_path)))
+    assert [row[1] for row in chart.rows] == ["–", "–"]
+    assert "no plain success" in chart.more and "Worst" not in chart.more
+
+
 def test_held_out_looks_stand_beside_those_for_training(folder):
     ((task, label, held_in, held_out, kept),) = looks(group(collect(folder)))
     assert (task, label.split(" ")[0]) == ("insert", "imagenet")

@@ -1,5 +1,6 @@
 """Exports that know their env: Minari recovers it, and robomimic reads every transition."""
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -40,6 +41,9 @@ def test_minari_recovers_the_env_and_its_episodes(demos, tmp_path, monkeypatch, 
     env = dataset.recover_environment()
     assert env.unwrapped.config.reward == "dense"
     assert env.spec.max_episode_steps == 300
+    held = dataclasses.replace(config, action_repeat=2)  # gymnasium counts actions
+    spec = export.spec_of(dataclasses.replace(found, config=held))
+    assert spec.max_episode_steps == 150
     assert env.observation_space == dataset.observation_space
     assert env.action_space == dataset.action_space
     for number, episode in enumerate(dataset.iterate_episodes()):

@@ -86,6 +86,7 @@ def drive(
     views=(),
     through=None,
     frames=None,
+    seed=SEED,
 ):
     """Drive one episode; return it, the lines of its log, the notices and the transport."""
     served = transport or Served(task, views)
@@ -95,14 +96,14 @@ def drive(
     told = []
     robot = DrivenRobot(client, views, task, 64, frames)
     driver = Driver(agent, robot, TaskConfig(task), config, dead_man, log, told.append)
-    episode = driver.episode(SEED, steps)
+    episode = driver.episode(seed, steps)
     return episode, [json.loads(line) for line in log.getvalue().splitlines()], told, served
 
 
-def by_expert(task):
-    """Return the env, and the (phase, action) pairs of the expert's success from `SEED`."""
+def by_expert(task, seed=SEED):
+    """Return the env, and the (phase, action) pairs of the expert's success from a start."""
     env = env_of(task)
-    env.reset(seed=SEED)
+    env.reset(seed=seed)
     expert = Expert(env)
     rows = []
     ended = False
@@ -251,19 +252,33 @@ def test_a_whole_procedure_succeeds_as_in_process():
 
 def test_what_a_client_does_is_recorded_as_it_was_told(tmp_path):
     """The recorded actions are the client's increments; the states are the simulation's."""
-    env, rows = by_expert("grasp")
+    seed = 3
+    env, rows = by_expert("grasp", seed)
     told = []
     with open_recordings(tmp_path / "demos", env.config, env.scene.hash) as recordings:
         served = Served("grasp", recordings=recordings, tell=told.append)
-        episode, _, _, _ = drive(Script(rows), "grasp", 300, transport=served)
+        episode, _, _, _ = drive(Script(rows), "grasp", 300, transport=served, seed=seed)
     assert episode.success
     demo = read_demo(list_demos(tmp_path / "demos")[0])
     assert np.allclose(demo.action, [action for _, action in rows], atol=1e-5)
     assert demo.success[-1]
     assert demo.demonstrator == "robot"
-    assert demo.seed == SEED
+    assert demo.seed == seed
     assert np.array_equal(demo.state[-1], served.robot.env.get_state())
-    assert "0 % of them clipped" in told[0]
+    assert told[0].startswith(f"start {SEED} is not kept") and "0 % of them clipped" in told[1]
+
+
+@pytest.mark.parametrize(("seed", "bank"), [(SEED, "tests"), (500_000, "validation")])
+def test_starts_that_are_reserved_are_not_recorded(tmp_path, seed, bank):
+    """A policy trained on them would be evaluated on what it has seen."""
+    env, rows = by_expert("grasp", seed)
+    told = []
+    with open_recordings(tmp_path / "demos", env.config, env.scene.hash) as recordings:
+        served = Served("grasp", recordings=recordings, tell=told.append)
+        episode, _, _, _ = drive(Script(rows), "grasp", 300, transport=served, seed=seed)
+    assert episode.success and not recordings.seeds
+    assert f"start {seed} is not kept: it is in the bank for {bank}" in told[-1]
+    assert "request a seed below 500000" in told[-1]
 
 
 def test_the_log_of_a_drive_becomes_demonstrations(tmp_path):

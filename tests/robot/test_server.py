@@ -240,8 +240,28 @@ def test_the_seconds_of_a_served_simulation_go_on_over_resets(monkeypatch, capsy
     options = ("--task", "grasp", "--clock", "stepped", "--seconds", "0.14", "--json")
     assert main(["robot", "serve", *options]) == 0
     said = capsys.readouterr().out.splitlines()
-    assert said[0].startswith("7 control steps")
+    assert said[0] == "7 control steps.", "the client sets the clock: no step is late"
     assert json.loads(said[-1])["steps"] == 7
+
+
+def test_a_recording_begins_from_a_training_start(monkeypatch, capsys, tmp_path):
+    class Asking(MemoryTransport):
+        """Asks for a step whenever the server waits."""
+
+        def wait(self, seconds):
+            self.publisher(topics.STEP)(StringStamped(Header(), ""))
+
+    begun = []
+    reset = SimulatedRobot.reset
+    monkeypatch.setattr(SimulatedRobot, "reset", lambda *of: begun.append(of[1]) or reset(*of))
+    monkeypatch.setattr("surgicai_vision.robot.transport.open_transport", lambda *_: Asking())
+    options = ("--task", "grasp", "--clock", "stepped", "--seconds", "0.02")
+    record = ("--record", str(tmp_path / "demos"))
+    assert main(["robot", "serve", *options]) == 0
+    assert main(["robot", "serve", *options, *record]) == 0
+    assert begun == [names.TEST_SEED, names.TRAIN_SEED]
+    assert main(["robot", "serve", *options, *record, "--seed", "900000"]) == 2
+    assert "reserved for validation" in capsys.readouterr().err
 
 
 def test_what_was_sent_before_a_reset_is_not_obeyed_after_it():
@@ -272,6 +292,19 @@ def test_a_reset_to_no_seed_is_answered_and_the_server_goes_on(text):
     client.say("/simulation/reset", StringStamped(Header(70), text))
     answers = [said.text for said in client.step()["/simulation/stepped"]]
     assert any(answer.startswith("70 a reset's text must be a seed") for answer in answers)
+
+
+def test_a_reset_to_a_seed_without_a_start_changes_nothing(monkeypatch):
+    """No start of a seed may be physical; that seed ends neither the server nor the episode."""
+    client = Client()
+    client.step()
+    before = client.env.get_state()
+    monkeypatch.setattr("surgicai_vision.envs.base.START_DRAWS", 0)
+    client.say("/simulation/reset", StringStamped(Header(70), "5"))
+    client.server.poll()
+    assert client.take()["/simulation/stepped"][0].text.startswith("70 No start of 'grasp'")
+    assert np.array_equal(client.env.get_state(), before)
+    assert (client.robot.seed, client.robot.steps) == (SEED, 1)
 
 
 def test_a_request_that_comes_twice_is_met_once(client):
@@ -374,7 +407,15 @@ def test_a_step_without_commands_is_a_step_of_zero_action():
     assert np.allclose(one.get_state(), other.get_state(), atol=1e-7)
 
 
-def test_delayed_actions_are_refused():
-    config = TaskConfig("grasp", randomisation=RandomisationConfig(latency=2))
-    with pytest.raises(InputError, match="latency"):
-        SimulatedRobot(envs.make(config))
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"randomisation": RandomisationConfig(latency=2)}, "latency"),
+        ({"action_repeat": 2}, "action_repeat"),
+        ({"hold_jaw": True}, "hold_jaw"),
+    ],
+)
+def test_an_env_that_changes_actions_is_refused(changes, problem):
+    """What is recorded of it would not be what its task says."""
+    with pytest.raises(InputError, match=problem):
+        SimulatedRobot(envs.make(TaskConfig("grasp", **changes)))

@@ -378,6 +378,14 @@ def test_wrong_input_is_one_line(arguments, said, monkeypatch, tmp_path, capsys)
     assert said in line
 
 
+def test_held_actions_are_refused(monkeypatch, tmp_path, capsys):
+    """The world would run at twice real time."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "held.yaml").write_text("env: {action_repeat: 2}")
+    assert main(["teleoperate", "--config", "held.yaml"]) == 2
+    assert "action_repeat is 2" in capsys.readouterr().err
+
+
 def test_help_and_documentation_have_the_key_table(root, capsys):
     assert main(["teleoperate", "--help"]) == 0
     assert key_table() in capsys.readouterr().out

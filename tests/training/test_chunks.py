@@ -140,9 +140,21 @@ def test_a_dataset_of_few_frames_has_its_actions_in_its_demonstrations(tmp_path:
     np.testing.assert_array_equal(found[names.ACTION_CHUNK], expected[names.ACTION_CHUNK])
     record(TaskConfig("place"), episodes=1, out=tmp_path / "others", context=RunContext(0))
     with pytest.raises(InputError, match="other demonstrations"):
-        timeline_of(few, tmp_path / "others")
+        timeline_of(few, [tmp_path / "others"])
     with pytest.raises(InputError, match="--demos"):
-        timeline_of(few, tmp_path / "nowhere")
+        timeline_of(few, [tmp_path / "nowhere"])
+
+    # One rendered from several folders has its actions in all of them, in that order.
+    both = [tmp_path / "others", tmp_path / "demos"]
+    options = {"views": ("back",), "size": 16, "frame_stride": 5}
+    render_demos(both, tmp_path / "joined", **options, context=RunContext(0))
+    joined = open_dataset(tmp_path / "joined")
+    chunks = with_chunks(joined, timeline_of(joined, both), range(-1, 9)).columns()
+    own = int(np.flatnonzero(joined.episode_index == 1)[0])
+    np.testing.assert_array_equal(chunks[names.ACTION_CHUNK][own:], expected[names.ACTION_CHUNK])
+    for wrong in (both[:1], both[::-1]):
+        with pytest.raises(InputError, match="in the order in which they were rendered"):
+            timeline_of(joined, wrong)
 
 
 def test_a_dataset_of_held_actions_has_each_of_them_once(tmp_path: Path) -> None:

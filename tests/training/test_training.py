@@ -23,6 +23,7 @@ from surgicai_vision.core.files import TEMPORARY
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import (
     CARD,
+    LOCK,
     REQUEST,
     WEIGHTS,
     check_encoder,
@@ -300,6 +301,32 @@ def test_a_training_that_was_killed_at_its_first_write_is_begun_again(tmp_path: 
     assert not list(tmp_path.glob(f"{TEMPORARY}*"))
 
 
+def test_what_a_killed_training_left_is_removed(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, [], BC, QUICK, out=tmp_path, save_every=2, progress=stop)
+    state = (tmp_path / STATE).read_bytes()
+    for name in (LOCK, f"{TEMPORARY}0-{STATE}", f"epochs/epoch_0002/{TEMPORARY}0-{WEIGHTS}"):
+        (tmp_path / name).write_bytes(b"torn")
+
+    train(dataset, [], BC, QUICK, out=tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {REQUEST, WEIGHTS, CARD, "epochs"}
+    assert not list(tmp_path.rglob(f"{TEMPORARY}*"))
+    (tmp_path / STATE).write_bytes(state)  # killed between the checkpoint and the end
+    train(dataset, [], BC, QUICK, out=tmp_path)
+    assert not (tmp_path / STATE).exists()
+
+
+def test_a_folder_in_which_another_process_trains_is_refused(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+
+    def again(done: int, total: int) -> None:
+        with pytest.raises(InputError, match="Another run is training"):
+            train(dataset, [], BC, QUICK, out=tmp_path)
+
+    train(dataset, [], BC, QUICK, out=tmp_path, progress=again)
+
+
 def test_training_again_does_nothing_and_another_request_is_refused(tmp_path: Path) -> None:
     dataset = FakeDataset()
     first = train(dataset, [], BC, QUICK, out=tmp_path / "a")
@@ -499,5 +526,13 @@ def test_a_policy_that_cannot_be_used_is_named(make: Any, message: str) -> None:
     try:
         with pytest.raises(InputError, match=rf"^The policy 'odd' of 'theirs' .*{message}"):
             policies.policy_plugin("odd").make(QUICK, ())
+    finally:
+        policies.POLICIES.unregister("odd")
+
+
+def test_a_policy_has_the_name_it_is_offered_under() -> None:
+    policies.register_policy("odd", replace(BC, name="something-else"), "theirs")
+    try:
+        assert policies.policy_plugin("odd").name == "odd"
     finally:
         policies.POLICIES.unregister("odd")

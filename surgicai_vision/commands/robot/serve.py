@@ -30,6 +30,7 @@ from surgicai_vision.commands.robot.network import (
     ros_domain,
 )
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import check_training_starts
 from surgicai_vision.core.config import ADVANCES, TaskConfig
 from surgicai_vision.core.processes import Terminated
 
@@ -61,7 +62,8 @@ class Options:
         compressed: Publish JPEG files in addition to the raw images.
         advance: How the judge of the whole procedure moves to the next subtask: by success, or when
             told on /simulation/enter, as a hierarchical policy with learned ends needs.
-        record: Keep every episode, from a reset to its success, as a demonstration in this folder.
+        record: Keep every episode, from a reset to its success, as a demonstration in this folder,
+            except from starts that are reserved for validation or tests.
         truth: Also publish the needle's pose and the present subtask, which no robot knows.
         transport: Middleware that carries the messages.
         interface: See `network.INTERFACE`.
@@ -70,7 +72,11 @@ class Options:
     """
 
     task: Annotated[str, TASK] = names.SUTURE
-    seed: Annotated[int, SEED] = names.TEST_SEED
+    seed: Annotated[
+        int | None,
+        SEED,
+        default_text(f"{names.TEST_SEED}, {names.TRAIN_SEED} with --record"),
+    ] = None
     clock: Annotated[str, Parameter(choices=("real", "stepped"))] = "real"
     view: Annotated[tuple[str, ...], VIEWS] = ()
     size: Annotated[int, IMAGE_SIZE] = 224
@@ -103,6 +109,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     from surgicai_vision.teleoperation.recordings import open_recordings
 
     domain = ros_domain(options.domain)
+    seed = _seed(options)
     config = ServeConfig(
         options.clock,
         options.view,
@@ -118,7 +125,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         transport = RenamedTransport(opened, renamed_topics(options.topics), options.view)
         env = envs.make(_task(options))
         robot = SimulatedRobot(env)
-        robot.reset(options.seed)
+        robot.reset(seed)
         recorder = None
         if options.record is not None:
             recordings = stack.enter_context(
@@ -143,10 +150,11 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
                     raise
             late = 1e3 * np.array(server.lateness or [0.0])
         env.close()
-    console.say(
-        f"{server.steps} control steps; they began late by {np.median(late):.2f} ms (median) and "
-        f"{np.percentile(late, 99):.2f} ms (99th percentile)."
+    kept_time = (
+        f"; they began late by {np.median(late):.2f} ms (median) and "
+        f"{np.percentile(late, 99):.2f} ms (99th percentile)"
     )
+    console.say(f"{server.steps} control steps{kept_time if server.lateness else ''}.")
     return {
         "task": options.task,
         "domain": domain,
@@ -155,6 +163,15 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         "late_ms_median": float(np.median(late)),
         "late_ms_p99": float(np.percentile(late, 99)),
     }
+
+
+def _seed(options: Options) -> int:
+    """Return the seed of the first start; what is recorded begins from training starts."""
+    if options.record is None:
+        return names.TEST_SEED if options.seed is None else options.seed
+    seed = names.TRAIN_SEED if options.seed is None else options.seed
+    check_training_starts(seed, 1)
+    return seed
 
 
 def _task(options: Options) -> TaskConfig:

@@ -4,7 +4,11 @@ Another distribution adds its own through an entry point:
 
     class MyEngine(Engine):
         name = "mine"
-        def execute(self, tasks, workers, attempts=None): …
+
+        def execute(self, tasks, workers, attempts=None):
+            for key, task in tasks.items():
+                failure = task.do()
+                yield key, failure.as_error(str(task.job)) if failure else None
 
     [project.entry-points."surgicai_vision.engines"]
     mine = "my_package:MyEngine"
@@ -27,7 +31,8 @@ class Engine(ABC):
     """Runs jobs; it never affects their results.
 
     An engine is a frozen dataclass whose fields are its options. It calls `jobs.perform` for each
-    task, in any process, and relies only on the store: a job whose folder is committed is done.
+    task, in any process, which returns the failure of a job. It relies only on the store: a job
+    whose folder is committed is done.
 
     Attributes:
         name: its key in the table.

@@ -5,12 +5,13 @@ An engine computes the missing results, which are committed whole.
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.executor.context import RunContext
+from surgicai_vision.core.executor.engine import Ending
 from surgicai_vision.core.executor.jobs import Job, Task
 from surgicai_vision.core.files import TEMPORARY, check_renamed, locked, sync_folder
 from surgicai_vision.core.progress import Progress, silent
@@ -46,7 +47,8 @@ def run(
 
     Raises:
         InputError: an unknown job, a store in use by another run, or bad input to a job.
-        SurgicaiError: a job failed, or its worker died at every attempt.
+        SurgicaiError: a job failed, its worker died at every attempt, or its result is missing
+            although the engine has ended.
     """
     by_key = {job.key(): job for job in jobs}
     with claim(store):
@@ -58,7 +60,7 @@ def run(
         tasks = {key: Task(job, job.kind.function, root / key) for key, job in missing.items()}
         endings = context.engine.execute(tasks, context.processes(), attempts)
         with closing(endings):  # workers end with it, whatever is raised here
-            for key, error in endings:
+            for key, error in _checked(endings, tasks, context.engine.name):
                 if ended:
                     ended(by_key[key], store / key, error)
                 elif error:
@@ -66,6 +68,27 @@ def run(
                 done += by_key[key].weight
                 progress(done, total, unit)
     return [store / job.key() for job in jobs]
+
+
+def _checked(endings: Iterable[Ending], tasks: Mapping[str, Task], engine: str) -> Iterator[Ending]:
+    """Yield an engine's endings, and an error for each task whose result is not in the store."""
+    told: set[str] = set()
+    for key, error in endings:
+        told.add(key)
+        yield key, error or _missing(tasks[key], engine)
+    for key, task in tasks.items():
+        if key not in told:
+            yield key, _missing(task, engine)
+
+
+def _missing(task: Task, engine: str) -> SurgicaiError | None:
+    """Return the error of a task that an engine has done without a result; None if it has one."""
+    if task.destination.is_dir():
+        return None
+    return SurgicaiError(
+        f"The executor '{engine}' has done {task.job}, but {task.destination} is missing; its "
+        "workers must share this folder, and it must yield the failure that `jobs.perform` returns."
+    )
 
 
 _claimed: set[Path] = set()

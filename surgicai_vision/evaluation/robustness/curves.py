@@ -35,7 +35,9 @@ from surgicai_vision.evaluation.storage import (
     MARKER,
     VISITS,
     Row,
+    find_evaluations,
     parquet_bytes,
+    read_evaluation,
     read_rows,
     read_versioned,
 )
@@ -51,9 +53,10 @@ def robustness(
     strengths: Sequence[float] = STRENGTHS,
     workers: int | None = None,
 ) -> list[Row]:
-    """Evaluate `spec` along every axis into `out` and return the rows of `robustness.parquet`.
+    """Evaluate `spec` along every axis into `out` and return their rows of `robustness.parquet`.
 
-    Existing results are kept, so running again continues, also with more axes or strengths.
+    Existing results are kept, so running again continues, also with other axes or strengths. The
+    table has every axis and strength that `out` holds.
 
     Args:
         spec: what is evaluated in which task.
@@ -73,10 +76,9 @@ def robustness(
     chosen = _checked(spec, axes, strengths)
     check_seeds(seeds)
     _claim(out, spec, seeds)
-    rows: list[Row] = []
-    plain: Path | None = None
+    places = [out / axis / f"{0.0:g}" for axis in AXES]
+    plain = next((place for place in places if (place / MARKER).exists()), None)
     for axis in chosen:
-        results = []
         for strength in strengths:
             folder = out / axis / f"{strength:g}"
             plain = plain or (folder if strength == 0 else None)
@@ -88,11 +90,24 @@ def robustness(
                         evaluate_into(
                             folder, shifted(spec, axis, strength), seeds, workers, progress
                         )
-            results.append([bool(row["success"]) for row in read_rows(folder)])
-        rows += _curve(axis, strengths, results)
+    rows: list[Row] = []
+    for axis in dict.fromkeys((*chosen, *AXES)):
+        stored = _stored(out / axis)
+        if stored:
+            rows += _curve(axis, list(stored), list(stored.values()))
     _correct(rows)
     files.write_bytes(out / CURVES, parquet_bytes(rows))
-    return rows
+    return [row for row in rows if row["axis"] in chosen]
+
+
+def _stored(folder: Path) -> dict[float, list[bool]]:
+    """Return the strengths that were evaluated along one axis, increasing: successes by start."""
+    found = {}
+    for place in find_evaluations(folder):
+        shift = read_evaluation(place).run.shift
+        if shift is not None and shift.axis == folder.name:
+            found[shift.strength] = [bool(row["success"]) for row in read_rows(place)]
+    return dict(sorted(found.items()))
 
 
 def _checked(spec: PolicySpec, axes: Sequence[str], strengths: Sequence[float]) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from surgicai_vision.core import names
@@ -59,6 +59,7 @@ def train_policy(
     run: Table,
     subtask: str | None,
     encodes_all: bool,
+    demos: Sequence[str],
     dataset: str,
     accept_licence: bool,
     device: str | None,
@@ -72,7 +73,16 @@ def train_policy(
     if subtask and not encodes_all:
         data = of_subtask(data, subtask)
         subtask = None
-    train_run(_run(run), data, folder, silent_stage, weights, subtask=subtask, device=device)
+    train_run(
+        _run(run),
+        data,
+        folder,
+        silent_stage,
+        weights,
+        subtask=subtask,
+        demos=[Path(one) for one in demos],
+        device=device,
+    )
 
 
 def train_and_evaluate(

@@ -15,7 +15,7 @@ from surgicai_vision.demos.store import demos_digest, list_demos
 from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_versioned
 from surgicai_vision.experiments.plan_config import plan_of
-from surgicai_vision.experiments.prepare import check_dataset
+from surgicai_vision.experiments.prepare import check_dataset, demos_folders
 from surgicai_vision.experiments.sweep.experiment import Experiment, Training
 from surgicai_vision.experiments.sweep.grid import Grid
 from surgicai_vision.experiments.sweep.lerobot import OPTIONS
@@ -326,14 +326,17 @@ class Jobs:
         """Return the job that trains a policy that runs share."""
         if training.run.algo:
             return self._actor(training)
+        name = training.dataset
+        demos = demos_folders(self.experiment.datasets[name], self.data_folder(name))
         arguments = {
             "run": to_mapping(training.run),
             "subtask": training.subtask,
             "encodes_all": training.encodes_all,
+            "demos": [str(folder.absolute()) for folder in demos],
             **self._common(training.dataset),
         }
         inputs = tuple(self._inputs(training.run, training.dataset))
-        return Job("sweep-policy", arguments, inputs, label=LABELS)
+        return Job("sweep-policy", arguments, inputs, label=(*LABELS, "demos"))
 
     def _actor(self, training: Training) -> Job:
         """Return the job that trains an actor that whole procedures share."""

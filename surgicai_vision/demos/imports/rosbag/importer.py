@@ -126,8 +126,14 @@ def base_config(task: str | None, env: Mapping[str, object] | None) -> TaskConfi
 
     Raises:
         UnknownName: no subtask of that name, or no such key.
-        InputError: an env whose actions are held; a recorded motion is that of every control step.
+        InputError: an env that names a task, which is a separate argument, or whose actions are
+            held; a recorded motion is that of every control step.
     """
+    if "task" in (env or {}):
+        raise InputError(
+            "env: the task is a separate option; write `task:` next to `env:`, or leave it out to "
+            "import every subtask that is found."
+        )
     config = from_mapping(
         TaskConfig, {**(env or {}), "task": check_name("subtask", task or "grasp", names.SUBTASKS)}
     )
