@@ -29,15 +29,8 @@ def connect(repo: str, api: "HfApi | None" = None) -> "HfApi":
         SurgicaiError: offline, or the Hub does not answer.
     """
     from huggingface_hub import HfApi, constants
-    from huggingface_hub.errors import HFValidationError
-    from huggingface_hub.utils import validate_repo_id
 
-    try:
-        validate_repo_id(repo)
-    except HFValidationError:
-        raise InputError(f"'{repo}' is not a valid name on the Hub; write user/name.") from None
-    if repo.count("/") != 1:
-        raise InputError(f"'{repo}' does not name its owner; write user/name.")
+    check_repository(repo)
     if api is not None:
         return api
     if constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in (
@@ -51,6 +44,19 @@ def connect(repo: str, api: "HfApi | None" = None) -> "HfApi":
         )
     reach(constants.ENDPOINT)
     return HfApi()
+
+
+def check_repository(repo: str) -> None:
+    """Raise `InputError` unless `repo` is "user/name", as the Hub allows it."""
+    from huggingface_hub.errors import HFValidationError
+    from huggingface_hub.utils import validate_repo_id
+
+    try:
+        validate_repo_id(repo)
+    except HFValidationError:
+        raise InputError(f"'{repo}' is not a valid name on the Hub; write user/name.") from None
+    if repo.count("/") != 1:
+        raise InputError(f"'{repo}' does not name its owner; write user/name.")
 
 
 def reach(endpoint: str) -> None:

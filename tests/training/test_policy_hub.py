@@ -128,6 +128,8 @@ def test_the_commands_show_the_card_and_say_when_offline(
 ) -> None:
     assert main(["policy", "push", str(policy), "--repo", REPO, "--dry-run"]) == 0
     assert "license: mit" in capsys.readouterr().out
+    assert main(["policy", "push", str(policy), "--repo", "../b", "--dry-run"]) == 2
+    assert "not a valid name on the Hub" in capsys.readouterr().err
     for arguments in (
         ["push", str(policy), "--repo", REPO],
         ["pull", REPO, "--out", str(tmp_path / "pulled")],

@@ -40,14 +40,12 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Check the dataset, push it and print where it is."""
-    from surgicai_vision.core.hub import connect
+    from surgicai_vision.core.hub import check_repository
     from surgicai_vision.dataset.hub import dataset_card, push_dataset
     from surgicai_vision.dataset.reader import open_dataset
 
     if options.dry_run:
-        from huggingface_hub import HfApi
-
-        connect(options.repo, HfApi())  # only the name is checked
+        check_repository(options.repo)
         console.say(dataset_card(open_dataset(options.dataset), options.repo, options.licence))
         return {"repo": options.repo, "dry_run": True}
     with console.stage("checking", "frames") as progress:

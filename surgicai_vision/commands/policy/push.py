@@ -50,6 +50,7 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Verify the policy, push it and print where it is."""
+    from surgicai_vision.core.hub import check_repository
     from surgicai_vision.training.checkpoint import read_checkpoint
     from surgicai_vision.training.hub import model_card, push_policy
     from surgicai_vision.training.released import resolve
@@ -63,6 +64,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     checkpoint = read_checkpoint(folder)
     successes = _successes(options.evaluation, checkpoint) if options.evaluation else None
     if options.dry_run:
+        check_repository(options.repo)
         console.say(model_card(checkpoint, options.repo, options.licence, successes))
         return {"repo": options.repo, "dry_run": True}
     address = push_policy(
