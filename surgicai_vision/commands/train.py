@@ -426,7 +426,7 @@ def _checked_folders(options: Options, runs: Sequence[RunConfig]) -> list[Path]:
     check_at_most(LARGEST_SEED, seed=max(run.seed for run in runs))
     outs = [options.out or folders.train_folder(run.task, run.name, run.seed) for run in runs]
     for out in outs:
-        folders.check_folder(out, REQUEST)
+        folders.check_folder(out, REQUEST, ours=(LOCK,))
     return outs
 
 

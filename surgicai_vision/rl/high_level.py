@@ -55,7 +55,7 @@ from surgicai_vision.rl.learner import linear, random_state, set_random_state
 from surgicai_vision.rl.stages import Stages
 from surgicai_vision.rl.train import EVALUATED_AT_ONCE, IMAGE_SIZE, Weights
 from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
-from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
+from surgicai_vision.training.folder import read_state, training_in, write_state
 from surgicai_vision.training.policies import policy_plugin
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
@@ -198,17 +198,15 @@ def train_high_level(
     common_images(agents)  # refuses images of several sizes before the folder is begun
     acting = [one.about.get("checkpoint") or one.name for one in low]
     wanted = {"code_version": __version__, "request": to_mapping(request), "low": acting}
-    if done := begin(out, wanted):
-        return done
-    with torch.random.fork_rng(devices=[]), one_thread():
+    with training_in(out, wanted) as done, torch.random.fork_rng(devices=[]), one_thread():
+        if done is not None:
+            return done
         env = DecisionEnv(request.low, spec.config, agents)
         try:
             make_low = [one.make_agent for one in low]
-            checkpoint = _run(request, spec.config, make_low, env, out, progress or silent)
+            return _run(request, spec.config, make_low, env, out, progress or silent)
         finally:
             env.close()
-    remove_state(out)
-    return checkpoint
 
 
 def _run(

@@ -50,7 +50,7 @@ from surgicai_vision.rl.stages import Stages
 from surgicai_vision.rl.train import Point, Weights
 from surgicai_vision.training import released
 from surgicai_vision.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
+from surgicai_vision.training.folder import read_state, training_in, write_state
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
 
@@ -173,16 +173,14 @@ def train_residual(
         "request": to_mapping(request),
         "base": spec.about["checkpoint"],
     }
-    if done := begin(out, wanted):
-        return done
-    with torch.random.fork_rng(devices=[]), one_thread():
+    with training_in(out, wanted) as done, torch.random.fork_rng(devices=[]), one_thread():
+        if done is not None:
+            return done
         training = _Training(request, spec)
         try:
-            checkpoint = training.run(out, progress or silent)
+            return training.run(out, progress or silent)
         finally:
             training.close()
-    remove_state(out)
-    return checkpoint
 
 
 def base_of(request: ResidualRequest, weights: WeightsSource = ANYWHERE) -> PolicySpec:

@@ -39,7 +39,7 @@ from surgicai_vision.rl.settings import STOP_AFTER, Request, read_by
 from surgicai_vision.rl.transitions import Transitions, of_demos
 from surgicai_vision.scene.kinematics import base_in_world
 from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
-from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
+from surgicai_vision.training.folder import read_state, training_in, write_state
 from surgicai_vision.training.policies import policy_plugin
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
@@ -109,16 +109,14 @@ def train(
     """
     check_extra(f"--algo {request.algo}", *_packages(request))
     wanted = {"algo": request.algo, "code_version": __version__, "request": to_mapping(request)}
-    if done := begin(out, wanted):
-        return done
-    with torch.random.fork_rng(devices=[]), one_thread():
+    with training_in(out, wanted) as done, torch.random.fork_rng(devices=[]), one_thread():
+        if done is not None:
+            return done
         learner = _learner(request, demos, workers)
         try:
-            checkpoint = _run(request, learner, out, progress, tensorboard)
+            return _run(request, learner, out, progress, tensorboard)
         finally:
             learner.close()
-    remove_state(out)
-    return checkpoint
 
 
 def train_seeds(

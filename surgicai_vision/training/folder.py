@@ -1,15 +1,12 @@
 """The folder of a training: its request, and the state from which it resumes.
 
-    if done := finished(out, request):    # refuses another training's folder
-        return done
-    with claimed(out):                    # and another process in it
-        if done := begin(out, request):
+    with training_in(out, request) as done:    # refuses another training's folder
+        if done is not None:
             return done
         …
-        write_state(out, state)           # periodically; a kill loses only what came since
-        state = read_state(out)           # None if there is no complete one
-        …
-        remove_state(out)                 # the checkpoint is written
+        write_state(out, state)    # periodically; a kill loses only what came since
+        state = read_state(out)    # None if there is no complete one
+        …                          # the checkpoint is written; the state is removed
 
 A state is plain data and tensors; reading it runs no code. Its file begins with the sha256 of what
 follows, so a file that is damaged or was written by something else is not a complete state.
@@ -46,8 +43,12 @@ STATE = "training_state.pt"
 DIGEST_BYTES = hashlib.sha256().digest_size
 
 
-def finished(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
-    """Return the checkpoint of a finished training; None if there is something left to train.
+@contextmanager
+def training_in(out: Path, request: Mapping[str, object]) -> Iterator[Checkpoint | None]:
+    """Yield the checkpoint of a finished training, or None while this process holds the folder.
+
+    The folder is made, or that of the same request continued: what a killed training left
+    unfinished in it is cleared, and the state is removed once the training has ended.
 
     Args:
         out: the checkpoint folder.
@@ -55,7 +56,27 @@ def finished(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
 
     Raises:
         OutputExists: `out` holds something else.
+        InputError: another process is training into it.
     """
+    if (done := _finished(out, request)) is not None:
+        yield done
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    refusal = InputError(
+        f"Another run is training into {out}; wait for it, stop it or give another --out."
+    )
+    with locked(out / LOCK, refusal=refusal):
+        done = _finished(out, request)  # another process may have finished it meanwhile
+        if done is None:
+            for folder in (out, *out.glob("epochs/*")):
+                remove_partial(folder, (REQUEST, STATE, WEIGHTS, CARD))
+            write_json(out / REQUEST, request)
+        yield done
+        _remove_state(out)
+
+
+def _finished(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
+    """Return the checkpoint of a finished training; None if there is something left to train."""
     check_output(out, may_resume=REQUEST, ours=(LOCK,))
     if (out / REQUEST).exists() and read_json(out / REQUEST) != request:
         raise OutputExists(
@@ -65,39 +86,8 @@ def finished(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
         return None
     checkpoint = read_checkpoint(out)
     with suppress(OSError):  # left by a process that was killed after its last write
-        remove_state(out)
+        _remove_state(out)
     return checkpoint
-
-
-@contextmanager
-def claimed(out: Path) -> Iterator[None]:
-    """Hold a training's folder exclusively, and clear what a killed training left unfinished in it.
-
-    Raises:
-        InputError: another process holds it.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    refusal = InputError(
-        f"Another run is training into {out}; wait for it, stop it or give another --out."
-    )
-    with locked(out / LOCK, refusal=refusal):
-        for folder in (out, *out.glob("epochs/*")):
-            remove_partial(folder, (REQUEST, STATE, WEIGHTS, CARD))
-        yield
-
-
-def begin(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
-    """Make a training's folder, or reuse one of the same request.
-
-    Returns and raises as `finished`.
-    """
-    if done := finished(out, request):
-        return done
-    out.mkdir(parents=True, exist_ok=True)
-    if not (out / REQUEST).exists():
-        remove_partial(out, (REQUEST,))
-    write_json(out / REQUEST, request)
-    return None
 
 
 def write_state(out: Path, state: Mapping[str, Any]) -> None:
@@ -121,6 +111,6 @@ def read_state(out: Path) -> dict[str, Any] | None:
     return state
 
 
-def remove_state(out: Path) -> None:
+def _remove_state(out: Path) -> None:
     """Remove the state of a training that is finished."""
     (out / STATE).unlink(missing_ok=True)

@@ -35,7 +35,7 @@ from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
 from surgicai_vision.features.devices import cuda_devices
 from surgicai_vision.training.checkpoint import Checkpoint
-from surgicai_vision.training.folder import begin, claimed, finished, remove_state
+from surgicai_vision.training.folder import training_in
 from surgicai_vision.training.loop import Log, Training
 from surgicai_vision.training.request import TrainingRequest, check_request, request_table
 from surgicai_vision.training.run_config import RunConfig
@@ -91,18 +91,13 @@ def train(
     request = TrainingRequest(dataset, tuple(features), policy, recipe, seed, run, progress_policy)
     out = Path(out)
     check_request(request)
-    table = request_table(request, start)
-    if done := finished(out, table):
-        return done
-    with claimed(out):
-        if done := begin(out, table):  # another process has finished it meanwhile
+    with training_in(out, request_table(request, start)) as done:
+        if done is not None:
             return done
         _keep_memory()
         where = torch.device(device)
         with _repeatable(where):
-            checkpoint = Training(request, start, where).run(out, save_every, progress, log)
-        remove_state(out)
-    return checkpoint
+            return Training(request, start, where).run(out, save_every, progress, log)
 
 
 def epochs_within(

@@ -16,6 +16,7 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
+from surgicai_vision.core.files import TEMPORARY
 from surgicai_vision.demos.store import demos_digest, list_demos
 from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS
 from surgicai_vision.evaluation.policy_spec import open_policy
@@ -122,11 +123,14 @@ def test_a_killed_training_ends_as_if_it_had_not_been_killed(algo, demos, tmp_pa
 
     def kill(done, total, unit=""):
         if 0 < done < total:
+            with pytest.raises(InputError, match="Another run is training"):
+                train(request, paths, tmp_path / "killed", tensorboard=False)
             raise Killed
 
     with pytest.raises(Killed):
         train(request, paths, tmp_path / "killed", progress=kill, tensorboard=False)
     assert (tmp_path / "killed" / STATE).exists()
+    (tmp_path / "killed" / f"{TEMPORARY}0-{STATE}").write_bytes(b"torn")
     started = []
     resumed = train(
         request,
@@ -137,6 +141,7 @@ def test_a_killed_training_ends_as_if_it_had_not_been_killed(algo, demos, tmp_pa
     )
     assert 0 < started[0] < request.total  # it continued
     assert resumed.policy_sha256 == whole.policy_sha256
+    assert not list((tmp_path / "killed").glob(f"{TEMPORARY}*"))
 
 
 @pytest.mark.parametrize("killed_at", [None, 36])
