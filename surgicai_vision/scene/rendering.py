@@ -13,7 +13,7 @@ people look at.
 import contextlib
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Protocol
@@ -183,8 +183,9 @@ class FrameRenderer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __del__(self) -> None:
-        if not sys.is_finalizing():  # then what it would call may be gone, and all is freed anyway
+    def __del__(self, is_finalizing: Callable[[], bool] = sys.is_finalizing) -> None:
+        # At the end of the process all is freed anyway, and this module's names may be gone.
+        if not is_finalizing():
             self.close()
 
     def _view(self, camera: str) -> mujoco.MjvCamera:

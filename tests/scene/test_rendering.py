@@ -12,6 +12,7 @@ from small_scene import BALL_RADIUS, PLANE_DISTANCE, small_spec
 
 from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.names import MODALITIES, PARTS
+from surgicai_vision.scene import rendering
 from surgicai_vision.scene.cameras import extrinsics, intrinsics
 from surgicai_vision.scene.rendering import FrameRenderer, parts_of_geoms, renderer_string
 
@@ -189,3 +190,10 @@ def test_a_process_that_closes_nothing_ends_cleanly():
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "2\n", "")
+
+
+def test_a_renderer_that_outlives_the_names_of_its_module_is_closed(monkeypatch):
+    renderer = FrameRenderer(small_spec().compile(), 32, 32)
+    monkeypatch.setattr(rendering, "sys", None)  # as towards the end of a process
+    renderer.__del__()
+    assert renderer._target is None
