@@ -187,15 +187,16 @@ def best_trained(groups: Sequence[Group]) -> Group | None:
 def as_trained(groups: Sequence[Group]) -> list[Group]:
     """Return the evaluations without a shift, on held-out starts.
 
-    If there are none without a shift, return those at strength 0, of one axis each, else all. If
-    none of these is on held-out starts, return those on others.
+    If there are none without a shift, return those at strength 0, each once and without its axis,
+    else all. If none of these is on held-out starts, return those on others.
     """
     evaluated = [item for item in groups if item.episodes]
     plain = [item for item in evaluated if item.condition.plain]
     unshifted: dict[Condition, Group] = {}
     for item in evaluated:
         if not item.condition.strength:
-            unshifted.setdefault(replace(item.condition, axis=""), item)
+            condition = replace(item.condition, axis="")
+            unshifted.setdefault(condition, replace(item, condition=condition))
     shown = plain or list(unshifted.values()) or evaluated
     return [item for item in shown if item.condition.is_held_out] or shown
 
