@@ -121,8 +121,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
                 raise InputError(
                     f"{option} does not go with --expert-swap {ALL}; give one subtask."
                 )
-        if options.dataset:
-            raise InputError("--dataset is only for replay; leave it out.")
+        _check_dataset(options.policy, options.dataset)
         _filming(options)  # refuses options that go with --video
         return _evaluate_swaps(options, console)
     spec = open_given(
@@ -205,11 +204,8 @@ def open_given(
     """Return the policy that the options of this or another command describe."""
     from surgicai_vision.evaluation.policy_spec import open_policy
 
-    demonstrated = None
-    if policy == REPLAY:
-        demonstrated = folders.open_dataset(dataset, task, ())
-    elif dataset:
-        raise InputError("--dataset is only for replay; leave it out.")
+    _check_dataset(policy, dataset)
+    demonstrated = folders.open_dataset(dataset, task, ()) if policy == REPLAY else None
     return open_policy(
         policy,
         task=task,
@@ -219,6 +215,12 @@ def open_given(
         weights=weights,
         changes=changes,
     )
+
+
+def _check_dataset(policy: str, dataset: Path | None) -> None:
+    """Refuse a dataset that the policy does not read."""
+    if dataset and policy != REPLAY:
+        raise InputError("--dataset is only for replay; leave it out.")
 
 
 def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:

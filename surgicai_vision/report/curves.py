@@ -81,7 +81,7 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
             if evaluated(item, task) and not (item.condition.expert_swap or item.condition.upset)
         ]
         for axis in dict.fromkeys(item.condition.axis for item in mine if item.condition.axis):
-            members = _by_condition(with_zero(mine, axis), base_of)
+            members = _by_condition(with_zero(mine, axis), lambda item: item.condition.unshifted)
             lines = _series(members, lambda item: item.condition.strength)
             if lines:
                 areas = {base: _area(members[base]) for base in lines}
@@ -96,15 +96,10 @@ def with_zero(groups: Sequence[Group], axis: str) -> list[Group]:
     An evaluation without a shift serves as strength 0 if none was made at that strength.
     """
     of_axis = [item for item in groups if item.condition.axis == axis]
-    lacking = {base_of(item) for item in of_axis} - {
-        base_of(item) for item in of_axis if item.condition.strength == 0
+    lacking = {item.condition.unshifted for item in of_axis} - {
+        item.condition.unshifted for item in of_axis if item.condition.strength == 0
     }
     return [*(item for item in groups if item.condition in lacking), *of_axis]
-
-
-def base_of(item: Group) -> Condition:
-    """Return the condition without its shift."""
-    return replace(item.condition, axis="", strength=0.0)
 
 
 def _area(items: Sequence[Group]) -> str:

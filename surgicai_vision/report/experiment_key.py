@@ -196,6 +196,11 @@ class Condition:
         return ", ".join(parts)
 
     @property
+    def unshifted(self) -> "Condition":
+        """The condition without its shift: what the strengths of all its axes have in common."""
+        return replace(self, axis="", strength=0.0)
+
+    @property
     def plain(self) -> bool:
         """Whether the world was not shifted, the expert not swapped in, and nothing upset."""
         return not (self.axis or self.expert_swap or self.upset)

@@ -195,7 +195,7 @@ def as_trained(groups: Sequence[Group]) -> list[Group]:
     unshifted: dict[Condition, Group] = {}
     for item in evaluated:
         if not item.condition.strength:
-            condition = replace(item.condition, axis="")
+            condition = item.condition.unshifted
             unshifted.setdefault(condition, replace(item, condition=condition))
     shown = plain or list(unshifted.values()) or evaluated
     return [item for item in shown if item.condition.is_held_out] or shown

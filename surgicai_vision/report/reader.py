@@ -273,13 +273,13 @@ def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
         if len(same) > 1:
             found = _places([result.folder.relative_to(folder) for result in same], condition)
             places |= zip([result.folder for result in same], found, strict=True)
-            of_policy.setdefault(_unshifted(condition), set()).update(found)
+            of_policy.setdefault(condition.unshifted, set()).update(found)
 
     def place_of(result: Result) -> Path:
         if result.folder in places:
             return places[result.folder]
         path = result.folder.relative_to(folder)
-        others = of_policy.get(_unshifted(result.condition), ())
+        others = of_policy.get(result.condition.unshifted, ())
         around = [place for place in others if path.is_relative_to(place)]
         return max(around, key=lambda place: len(place.parts), default=Path())
 
@@ -302,11 +302,6 @@ def _places(folders: Sequence[Path], condition: Condition) -> list[Path]:
     of_curve = (condition.axis, f"{condition.strength:g}")
     curves = [each[:-2] if each[-2:] == of_curve else each for each in parts]
     return [Path(*each) for each in (curves if len(set(curves)) == len(curves) else parts)]
-
-
-def _unshifted(condition: Condition) -> Condition:
-    """Return what all curves of a policy have in common."""
-    return replace(condition, axis="", strength=0.0)
 
 
 def read_probes(folder: Path) -> list[dict[str, Any]]:

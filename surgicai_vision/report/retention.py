@@ -20,7 +20,7 @@ from surgicai_vision.evaluation import statistics
 from surgicai_vision.evaluation.robustness import ALL
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Bar
-from surgicai_vision.report.curves import Chart, base_of, evaluated, with_zero
+from surgicai_vision.report.curves import Chart, evaluated, with_zero
 from surgicai_vision.report.experiment_key import Condition, labels
 from surgicai_vision.report.groups import Group
 from surgicai_vision.report.reader import Result
@@ -60,7 +60,7 @@ def retentions(groups: Sequence[Group]) -> list[Chart]:
         for axis in axes:
             along: dict[Condition, list[Group]] = {}
             for item in with_zero(mine, axis):
-                along.setdefault(base_of(item), []).append(item)
+                along.setdefault(item.condition.unshifted, []).append(item)
             for base, items in along.items():
                 one = _kept(axis, items)
                 if one is not None:

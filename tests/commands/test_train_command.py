@@ -119,7 +119,7 @@ def test_the_folder_of_every_seed_is_checked_before_the_first_is_trained(
     }
     checked = []
 
-    def check(out, marker):
+    def check(out, marker, ours=()):
         checked.append(out)
         if len(checked) == 2:
             raise OutputExists(f"--out {out} already holds files.")
@@ -148,7 +148,7 @@ def test_the_weights_given_are_those_of_the_policies_that_are_kept(
     def begin(*arguments):
         raise AssertionError("begun")
 
-    monkeypatch.setattr("surgicai_vision.rl.high_level.begin", begin)
-    monkeypatch.setattr("surgicai_vision.rl.residual.begin", begin)
+    monkeypatch.setattr("surgicai_vision.rl.high_level.training_in", begin)
+    monkeypatch.setattr("surgicai_vision.rl.residual.training_in", begin)
     assert main(["train", *given[option], "--weights", "nowhere.bin"]) != 0
     assert "nowhere.bin" in capsys.readouterr().err

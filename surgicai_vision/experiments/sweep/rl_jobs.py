@@ -13,7 +13,7 @@ from pathlib import Path
 from surgicai_vision.core.config import JSON, from_mapping, read_changes
 from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import silent_stage, timed
-from surgicai_vision.demos.store import demos_digest, list_demos
+from surgicai_vision.demos.store import demos_digest, first_demos
 from surgicai_vision.evaluation.hierarchical_config import HLP, ORDER, HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import PolicySpec, hierarchical_policy, open_policy
 from surgicai_vision.evaluation.storage import RESULT_FILE
@@ -90,7 +90,7 @@ def train_and_evaluate(
 def _train(run: RunConfig, demos: str, validation: int, save_every: int, scratch: Path) -> Path:
     """Train an actor, or continue its training; return the folder of its checkpoint."""
     assert run.algo is not None, "a sweep over algorithms has runs of algorithms alone"
-    paths = list_demos(Path(demos))[: run.demonstrations] if demos else []
+    paths = first_demos(Path(demos), run.demonstrations) if demos else []
     request = Request(
         algo=run.algo,
         env=run.env,
