@@ -14,6 +14,7 @@ from surgicai_vision.commands.policy import push
 from surgicai_vision.core import names
 from surgicai_vision.core.config import SceneConfig, TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.evaluation.statistics import clopper_pearson
 from surgicai_vision.evaluation.storage import FORMAT
 from surgicai_vision.scene import build_scene
 from surgicai_vision.training.checkpoint import CARD, WEIGHTS, Checkpoint, read_checkpoint
@@ -142,7 +143,7 @@ def test_the_commands_show_the_card_and_say_when_offline(
 
 def write_stored(folder: Path, trained: Checkpoint, **changes: object) -> None:
     """Write the marker of an evaluation of a policy, whose run is changed."""
-    counts = {"successes": 1, "episodes": 2, "ci95": [0.01, 0.99]}
+    counts = {"successes": 2, "episodes": 2, "ci95": [0.9, 1.0]}  # not those of the episodes
     stored = {
         "format": FORMAT,
         "run": to_mapping(replace(trained.run, **changes)),
@@ -157,15 +158,19 @@ def seeds(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Seeds of the starts that an evaluation is read to have."""
     found = [names.TEST_SEED, names.TEST_SEED + 1]
     monkeypatch.setattr(
-        "surgicai_vision.evaluation.storage.read_rows", lambda _: [{"seed": seed} for seed in found]
+        "surgicai_vision.evaluation.storage.read_rows",
+        lambda _: [{"seed": seed, "success": seed == found[0]} for seed in found],
     )
     return found
 
 
-def test_successes_are_those_of_this_policy(tmp_path: Path, policy: Path, seeds: list[int]) -> None:
+def test_successes_are_counted_from_the_episodes_of_this_policy(
+    tmp_path: Path, policy: Path, seeds: list[int]
+) -> None:
     trained = read_checkpoint(policy)
     write_stored(tmp_path, trained)
-    assert push._successes(tmp_path, trained) == Successes(1, 2, (0.01, 0.99), tuple(seeds))
+    found = push._successes(tmp_path, trained)
+    assert found == Successes(1, 2, clopper_pearson(1, 2), tuple(seeds))
     write_stored(tmp_path, replace(trained, policy_sha256="0" * 64))
     with pytest.raises(InputError, match="of another policy"):
         push._successes(tmp_path, trained)

@@ -79,16 +79,18 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
 
 def _successes(folder: Path, checkpoint: "Checkpoint") -> "Successes":
-    """Return the successes of an evaluation.
+    """Return the successes of an evaluation, counted from its episodes.
 
     Raises:
         InputError: it is of another policy, or no evaluation of it as it was trained, on held-out
             starts.
     """
+    from surgicai_vision.evaluation.statistics import clopper_pearson
     from surgicai_vision.evaluation.storage import read_evaluation, read_rows
     from surgicai_vision.training.hub import Successes
 
-    seeds = [int(row["seed"]) for row in read_rows(folder)]
+    rows = read_rows(folder)
+    seeds = [int(row["seed"]) for row in rows]
     evaluation = read_evaluation(folder)
     evaluated = evaluation.about.get("checkpoint")
     sha256 = evaluated.get("policy_sha256") if isinstance(evaluated, dict) else None
@@ -111,11 +113,10 @@ def _successes(folder: Path, checkpoint: "Checkpoint") -> "Successes":
             f"--evaluation {folder} has {' and '.join(wrong)}; the card names the successes of the "
             "policy as it was trained. Give the folder of a plain evaluate, or leave it out."
         )
-    summary = evaluation.summary
-    low, high = summary["ci95"]
+    count = sum(bool(row["success"]) for row in rows)
     return Successes(
-        count=summary["successes"],
-        episodes=summary["episodes"],
-        interval=(low, high),
+        count=count,
+        episodes=len(rows),
+        interval=clopper_pearson(count, len(rows)),
         seeds=tuple(seeds),
     )
