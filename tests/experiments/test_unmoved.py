@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
@@ -50,13 +51,24 @@ def test_every_run_counts_on_the_same_held_out_starts_and_learns_from_held_in_lo
         assert dataset.first_seed + 4 * dataset.demonstrations.episodes < names.VALIDATION_SEED
 
 
+def test_corrupted_images_are_of_the_demonstrations_that_clear_ones_are_of():
+    for seed in UNMOVED.seed:
+        clear, corrupted = (
+            UNMOVED.datasets[f"seed{seed}/{name}"] for name in ("place", "place-corrupted")
+        )
+        assert corrupted.first_seed == clear.first_seed
+        other = {"name": "place-corrupted", "corruption": 0.5}
+        assert corrupted.demonstrations == replace(clear.demonstrations, **other)
+
+
 def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
-    assert by_condition(UNMOVED) == {
-        "held-in looks": 10,
-        "held-out looks": 10,
-        "all axes at half strength": 10,
-        "needles never seen": 10,
-    }
+    conditions = (
+        "held-in looks",
+        "held-out looks",
+        "all axes at half strength",
+        "needles never seen",
+    )
+    assert by_condition(UNMOVED) == dict.fromkeys(conditions, 2 * 6)  # `place` twice
     assert {run.task for run in UNMOVED.runs} == set(names.SUBTASKS)
     assert UNMOVED.seed == (0, 1)
     for dataset in UNMOVED.datasets.values():
