@@ -60,6 +60,7 @@ COMMANDS = MappingProxyType(
         "probe": "Read the needle's pose from frozen features with a linear probe.",
         "cache": "List, measure or prune the cached features.",
         "train": "Train a policy on a dataset's features.",
+        "train-detector": "Train a detector of the jaws, by which crops can be aimed.",
         "policies": "List the policies that come with the product.",
         "policy": "Share a trained policy, or tune one.",
         "evaluate": "Run a policy from held-out starts and count successes.",

@@ -15,6 +15,7 @@ from surgicai_vision.commands.options import (
     VIEWS,
     AcceptLicence,
     DatasetFolder,
+    DetectorFolder,
     EnvFields,
     EvaluationWorkers,
     PolicyName,
@@ -64,6 +65,8 @@ class Options:
         dataset: With policy replay, the dataset whose mean demonstration it plays.
         change: For a policy that plans chunks, values of execute, samples and ensemble to use
             instead of its recipe's.
+        detector: Folder of a detector; crops are then cut where it sees the jaws
+            (docs/detection.md).
         expert_swap: For a hierarchical policy, the subtask in which the expert acts instead; all
             takes each subtask in turn.
         upset: Make one thing go wrong in every episode, drawn by its start's seed: the needle is
@@ -87,6 +90,7 @@ class Options:
     change: Annotated[
         tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]"), default_text("none")
     ] = ()
+    detector: DetectorFolder = None
     expert_swap: Annotated[
         str | None, Parameter(choices=(*names.SUBTASKS, ALL), metavar="SUBTASK")
     ] = None
@@ -115,6 +119,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
             "--video": options.video,
             "--upset": options.upset,
             "--change": options.change,
+            "--detector": options.detector,
         }
         for option, given in refused.items():
             if given:
@@ -132,6 +137,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         WeightsSource.parse(options.weights, options.accept_licence),
         options.expert_swap,
         options.change,
+        options.detector,
     )
     if options.upset:
         check_upset_task(spec.config.task)
@@ -200,13 +206,14 @@ def open_given(
     weights: WeightsSource,
     expert_swap: str | None = None,
     changes: tuple[str, ...] = (),
+    detector: Path | None = None,
 ) -> "PolicySpec":
     """Return the policy that the options of this or another command describe."""
     from surgicai_vision.evaluation.policy_spec import open_policy
 
     _check_dataset(policy, dataset)
     demonstrated = folders.open_dataset(dataset, task, ()) if policy == REPLAY else None
-    return open_policy(
+    spec = open_policy(
         policy,
         task=task,
         env=cast("dict[str, JSON] | None", env),
@@ -215,6 +222,11 @@ def open_given(
         weights=weights,
         changes=changes,
     )
+    if detector is None:
+        return spec
+    from surgicai_vision.evaluation.aimed_agent import aimed
+
+    return aimed(spec, detector)
 
 
 def _check_dataset(policy: str, dataset: Path | None) -> None:

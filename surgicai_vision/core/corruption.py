@@ -31,18 +31,27 @@ SMOKE_KNOTS, SMOKE_DRIFT = 5, 1 / 200
 
 @dataclass(frozen=True)
 class Moment:
-    """When and where an image was taken: start seed, step in the episode, index of the view."""
+    """When and where an image was taken.
+
+    Attributes:
+        seed: start seed.
+        step: step in the episode.
+        view: index of the view.
+        part: share of the image's height that its viewer looks at, if crops are cut from it: the
+            blur is that of an image which shows this part alone.
+    """
 
     seed: int
     step: int
     view: int
+    part: float = 1.0
 
 
 def blur(image: Image, strength: float, moment: Moment) -> Image:
     """Return the image out of focus."""
     import cv2
 
-    sigma = strength * BLUR * image.shape[0]
+    sigma = strength * BLUR * moment.part * image.shape[0]
     if sigma == 0:
         return image
     changed: Image = cv2.GaussianBlur(image, (0, 0), sigma)

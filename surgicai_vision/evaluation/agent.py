@@ -67,7 +67,10 @@ class Agent(abc.ABC):
     Attributes:
         name: the agent's name in messages; an evaluation sets it to the name in its tables.
         cameras: cameras it needs, empty for none.
-        image_size: height and width of their images [px].
+        image_size: height of their images [px].
+        aspect: width of their images over their height.
+        part: share of an image's height that it looks at, if it cuts crops from whole images
+            (`corruption.Moment`).
         depth: whether it needs their depth too.
         privileged: whether it reads the env's own state, so that it acts only in simulation.
         action_mode: what its actions are, one of `names.ACTION_MODES`: "increments" of the active
@@ -77,6 +80,8 @@ class Agent(abc.ABC):
     name: str
     cameras: tuple[str, ...] = ()
     image_size: int = 224
+    aspect: float = 1.0
+    part: float = 1.0
     depth: bool = False
     privileged: bool = False
     action_mode: str = names.INCREMENTS

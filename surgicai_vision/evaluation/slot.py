@@ -61,7 +61,12 @@ class Episode:
 def env_of(agent: Agent, config: TaskConfig) -> Env:
     """Make an env that shows what the agent sees, and renders an image only when it is accessed."""
     return env_showing(
-        config, agent.cameras, agent.image_size, depth=agent.depth, action_mode=agent.action_mode
+        config,
+        agent.cameras,
+        agent.image_size,
+        aspect=agent.aspect,
+        depth=agent.depth,
+        action_mode=agent.action_mode,
     )
 
 
@@ -70,6 +75,7 @@ def env_showing(
     cameras: Sequence[str],
     image_size: int,
     *,
+    aspect: float = 1.0,
     depth: bool = False,
     action_mode: str = names.INCREMENTS,
 ) -> Env:
@@ -78,7 +84,7 @@ def env_showing(
         config,
         obs_type="pixels_agent_pos" if cameras else "state",
         cameras=cameras,
-        image_size=image_size,
+        image_size=(image_size, round(image_size * aspect)),
         depth=depth,
         action_mode=action_mode,
     )

@@ -113,6 +113,8 @@ class RunConfig:
         expert_swap: the subtask of a hierarchical policy that the expert performs.
         acted_by: settings for executing its chunks in an evaluation, "key=value" each, instead of
             its recipe's (`ACTED_BY`).
+        detector: hash of the weights of the detector that aims its crops in an evaluation
+            (`evaluation.aimed_agent`); empty if crops lie where the arm reports its jaws.
         starts: start states of the evaluation; None before it.
         shift: what is shifted in an evaluation of robustness.
         upset: one thing goes wrong in every episode of the evaluation (`envs.upset`).
@@ -146,6 +148,7 @@ class RunConfig:
     parts: str = ""
     expert_swap: str | None = None
     acted_by: tuple[str, ...] = field(default=(), metadata=LATER)
+    detector: str = field(default="", metadata=LATER)
     starts: Starts | None = None
     shift: Shift | None = None
     upset: bool = False
@@ -246,6 +249,8 @@ class RunConfig:
             parts += [f"from-{self.multiplied_from}"] if self.multiplied_from else []
             parts += [f"dagger-{self.dagger_rounds}"] if self.dagger_rounds else []
             parts += ["+".join(("acting", *self.acted_by))] if self.acted_by else []
+        if self.detector:
+            parts.append(f"aimed-{self.detector[:8]}")
         if self.expert_swap:
             parts.append(f"expert-{self.expert_swap}")
         return "-".join(parts).replace(":", "-")
@@ -298,6 +303,7 @@ def of_training(run: RunConfig) -> RunConfig:
         env=run.recorded_in or run.env,
         recorded_in=None,
         acted_by=(),
+        detector="",
         starts=None,
         shift=None,
         expert_swap=None,

@@ -40,7 +40,7 @@ def completed(script, *words):
 @pytest.mark.parametrize(
     ("words", "offered"),
     [
-        (["tr"], ["train"]),
+        (["tr"], ["train", "train-detector"]),
         (["re"], ["record-demos", "render-demos", "release", "report"]),
         (["dataset", ""], ["check", "convert", "push", "pull"]),
         (["dataset", "check", "--j"], ["--json"]),

@@ -36,6 +36,8 @@ class CorruptedAgent(Agent):
         self.name = agent.name
         self.cameras = agent.cameras
         self.image_size = agent.image_size
+        self.aspect = agent.aspect
+        self.part = agent.part
         self.depth = agent.depth
         self.privileged = agent.privileged
         self.action_mode = agent.action_mode
@@ -76,7 +78,7 @@ class CorruptedAgent(Agent):
         if not self.cameras:
             return observation
         moments = {
-            view: Moment(self._seeds[slot], self._steps[slot], camera_number(view))
+            view: Moment(self._seeds[slot], self._steps[slot], camera_number(view), self.part)
             for view in self.cameras
         }
 

@@ -1,0 +1,187 @@
+"""An agent whose crops lie where a detector sees the jaws (`surgicai_vision.detection`).
+
+    spec = aimed(open_policy("outputs/train/place-…"), Path("outputs/detector"))
+
+It looks at whole images of the crops' cameras, finds the jaws in them and cuts each crop about the
+jaws of its arm, at the scale that the nominal calibration gives. So it needs neither the reported
+joints nor the cameras' poses to aim, and errors of both are left out of the crops. The policy it
+wraps is unchanged. Inputs other than images still come from the reported joints.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.core.cameras import CAMERAS
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.lazy import LazyMapping
+from surgicai_vision.detection.detector import Detector, check_cameras, load_detector, read_card
+from surgicai_vision.detection.examples import PART, WHOLE
+from surgicai_vision.detection.network import SIZE
+from surgicai_vision.evaluation.agent import (
+    Actions,
+    Agent,
+    FeatureTable,
+    MakeAgent,
+    Observation,
+    Robot,
+    frame_of,
+)
+from surgicai_vision.scene.cameras import CameraPose, Crop, crop_of
+from surgicai_vision.scene.crops import whole_size
+
+if TYPE_CHECKING:
+    from surgicai_vision.core.corruption import Image
+    from surgicai_vision.evaluation.policy_spec import PolicySpec
+
+
+def aimed(spec: "PolicySpec", folder: Path) -> "PolicySpec":
+    """Return a policy whose crops lie where the detector in `folder` sees the jaws.
+
+    Raises:
+        BadFile: the folder holds no detector, or a damaged one.
+        UnknownName: the detector does not know a camera of the policy's crops.
+        InputError: a policy with a view that is no crop.
+    """
+    card = read_card(folder)
+    views = spec.run.views
+    lacking = [view for view in views if crop_of(view) is None]
+    if lacking or not views:
+        raise InputError(
+            f"A detector aims crops, and {spec.name} sees {', '.join(lacking) or 'no images'}; "
+            "give a policy whose views are all crops, such as front_psm2."
+        )
+    check_cameras(card, tuple(dict.fromkeys(_crop(view).camera for view in views)))
+    load_detector(folder)
+    return dataclasses.replace(
+        spec,
+        run=dataclasses.replace(spec.run, detector=card.weights_sha256),
+        make=functools.partial(_make_aimed, spec.make, folder),
+        about={**spec.about, "detector": str(folder)},
+    )
+
+
+def _make_aimed(make: MakeAgent, folder: Path) -> Agent:
+    """Make the agent (in a worker process)."""
+    return AimedAgent(make(), load_detector(folder))
+
+
+def _crop(view: str) -> Crop:
+    """Return the crop called `view`; `aimed` has refused every other view."""
+    crop = crop_of(view)
+    assert crop is not None
+    return crop
+
+
+@final
+class AimedAgent(Agent):
+    """An agent whose crops are cut from whole images.
+
+    Args:
+        agent: who acts; it sees nothing but crops, of one size.
+        detector: finds the jaws.
+    """
+
+    image_size = WHOLE[0]
+    aspect = WHOLE[1] / WHOLE[0]
+    part = PART
+
+    def __init__(self, agent: Agent, detector: Detector):
+        self.name = agent.name
+        self.privileged = agent.privileged
+        self.action_mode = agent.action_mode
+        self._agent = agent
+        self._detector = detector
+        self._crops = {view: _crop(view) for view in agent.cameras}
+        self._side = agent.image_size
+        self.cameras = tuple(dict.fromkeys(crop.camera for crop in self._crops.values()))
+
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
+        """Reset the wrapped agent."""
+        self._agent.reset(slot, robot, seed)
+
+    def restart(self, slot: int) -> None:
+        """Restart the wrapped agent."""
+        self._agent.restart(slot)
+
+    def share(self, features: FeatureTable) -> None:
+        """Let the wrapped agent share features."""
+        self._agent.share(features)
+
+    def act(
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
+    ) -> Actions:
+        """Return the agent's actions (n, 7) on its crops."""
+        return self._agent.act(slots, robots, [self._seen(seen) for seen in observations])
+
+    def _seen(self, observation: Observation) -> Observation:
+        """Return an observation whose crops are cut when they are accessed."""
+        assert isinstance(observation, Mapping), "the env of an agent with cameras shows images"
+        found = LazyMapping(
+            {camera: functools.partial(self._find, observation, camera) for camera in self.cameras},
+            {},
+        )
+        crops = {
+            view: functools.partial(self._cut, observation, crop, found)
+            for view, crop in self._crops.items()
+        }
+        others = {
+            key: functools.partial(frame_of, observation, key)
+            for key in observation
+            if key not in self.cameras
+        }
+        return LazyMapping({**others, **crops}, {})
+
+    def _find(self, observation: Observation, camera: str) -> NDArray[np.float32]:
+        """Return where a camera shows both arms' jaws, (2, 2), shares of width and height."""
+        small = cv2.resize(_whole(observation, camera), SIZE[::-1], interpolation=cv2.INTER_AREA)
+        places, _ = self._detector.find(np.asarray(small, np.uint8)[None], camera)
+        found: NDArray[np.float32] = places[0]
+        return found
+
+    def _cut(
+        self, observation: Observation, crop: Crop, found: Mapping[str, NDArray[np.float32]]
+    ) -> "Image":
+        """Return the crop about its arm's jaws."""
+        place = found[crop.camera][names.ARMS.index(crop.arm)]
+        return cut(_whole(observation, crop.camera), crop, place, self._side)
+
+
+def cut(image: "Image", crop: Crop, place: NDArray[np.float32], side: int) -> "Image":
+    """Return the part of a whole image that a crop shows when it lies about a place.
+
+    As in `scene.crops`, a crop near the border shows the part of the image at that border.
+
+    Args:
+        image: whole image of the crop's camera, (height, width, 3).
+        crop: whose scale is taken.
+        place: x and y as shares of the image's width and height.
+        side: height and width of the result [pixel].
+    """
+    camera = CAMERAS.load(crop.camera)
+    assert isinstance(camera, CameraPose), "a crop is cut from a camera's image"
+    height, width = image.shape[:2]
+    # Pixels of the whole image per pixel of the crop.
+    scale = height / whole_size(crop, camera.fovy, side, side)[0]
+    reach = scale * side / 2
+    x = min(max(float(place[0]) * width, reach), width - reach)
+    y = min(max(float(place[1]) * height, reach), height - reach)
+    # The centre of the first pixel is at 0, its corner at -0.5.
+    first = 0.5 * scale - 0.5 - reach
+    affine = np.array([[scale, 0.0, x + first], [0.0, scale, y + first]])
+    part = cv2.warpAffine(
+        image, affine, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    )
+    return np.asarray(part, np.uint8)
+
+
+def _whole(observation: Observation, camera: str) -> "Image":
+    """Return a camera's whole image."""
+    return frame_of(observation, camera).astype(np.uint8, copy=False)
