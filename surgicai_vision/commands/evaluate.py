@@ -15,7 +15,7 @@ from surgicai_vision.commands.options import (
     VIEWS,
     AcceptLicence,
     DatasetFolder,
-    DetectorFolder,
+    DetectorName,
     EnvFields,
     EvaluationWorkers,
     PolicyName,
@@ -65,8 +65,8 @@ class Options:
         dataset: With policy replay, the dataset whose mean demonstration it plays.
         change: For a policy that plans chunks, values of execute, samples and ensemble to use
             instead of its recipe's.
-        detector: Folder of a detector; crops are then cut where it sees the jaws
-            (docs/detection.md).
+        detector: Folder of a detector, or released:detector; crops are then cut where it sees the
+            jaws (docs/detection.md).
         expert_swap: For a hierarchical policy, the subtask in which the expert acts instead; all
             takes each subtask in turn.
         upset: Make one thing go wrong in every episode, drawn by its start's seed: the needle is
@@ -90,7 +90,7 @@ class Options:
     change: Annotated[
         tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]"), default_text("none")
     ] = ()
-    detector: DetectorFolder = None
+    detector: DetectorName = None
     expert_swap: Annotated[
         str | None, Parameter(choices=(*names.SUBTASKS, ALL), metavar="SUBTASK")
     ] = None
@@ -206,7 +206,7 @@ def open_given(
     weights: WeightsSource,
     expert_swap: str | None = None,
     changes: tuple[str, ...] = (),
-    detector: Path | None = None,
+    detector: str | None = None,
 ) -> "PolicySpec":
     """Return the policy that the options of this or another command describe."""
     from surgicai_vision.evaluation.policy_spec import open_policy

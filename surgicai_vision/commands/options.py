@@ -144,8 +144,10 @@ PolicyTask = Annotated[str | None, TASK, default_text("the checkpoint's, else gr
 EvaluationWorkers = Annotated[
     int | None, COUNT, default_text("one per core, at most one per four episodes")
 ]
-DetectorFolder = Annotated[
-    Path | None, DIRECTORY, default_text("none: crops lie where the arm reports its jaws")
+DetectorName = Annotated[
+    str | None,
+    Parameter(metavar="DIR"),
+    default_text("none: crops lie where the arm reports its jaws"),
 ]
 DatasetFolder = Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")]
 WeightFiles = Annotated[

@@ -17,7 +17,7 @@ from surgicai_vision.commands.options import (
     UNIQUE,
     AcceptLicence,
     DatasetFolder,
-    DetectorFolder,
+    DetectorName,
     EnvFields,
     EvaluationWorkers,
     PolicyName,
@@ -50,8 +50,8 @@ class Options:
         strength: Strengths of the shift, from 0 (none) to 1, increasing.
         episodes: Number of episodes at each strength.
         seed: Seed of the first start; each episode takes the next.
-        detector: Folder of a detector; crops are then cut where it sees the jaws
-            (docs/detection.md).
+        detector: Folder of a detector, or released:detector; crops are then cut where it sees the
+            jaws (docs/detection.md).
         workers: Number of processes.
         dataset: With policy replay, the dataset whose mean demonstration it plays.
         out: Folder to create or continue.
@@ -68,7 +68,7 @@ class Options:
     strength: Annotated[tuple[float, ...], LIST, Parameter(metavar="NUMBER[,NUMBER]")] = STRENGTHS
     episodes: Annotated[int, COUNT] = 20
     seed: Annotated[int, SEED] = names.TEST_SEED
-    detector: DetectorFolder = None
+    detector: DetectorName = None
     workers: EvaluationWorkers = None
     dataset: DatasetFolder = None
     weights: WeightFiles = ()

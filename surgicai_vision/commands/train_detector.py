@@ -12,6 +12,7 @@ from surgicai_vision.commands.options import COUNT, DIRECTORY, EXECUTOR, LIST, S
 from surgicai_vision.core.cameras import check_camera
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.words import plural
+from surgicai_vision.detection.card import CARD
 
 app = App(
     name="train-detector",
@@ -69,7 +70,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
             )
     for folder in options.demos:
         folders.demos_task(folder)
-    folders.check_folder(options.out, "detector.json")
+    folders.check_folder(options.out, CARD)
     if context.engine == LOCAL:  # with other engines the workers must be able to draw
         check_opengl()
     from surgicai_vision.detection.fit import train_detector

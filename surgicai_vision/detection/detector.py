@@ -1,15 +1,11 @@
-"""The trained detector and its folder.
+"""The trained detector.
 
-    detector = load_detector(Path("outputs/detector"))
-    places, confidences = detector.find(images, "front")
-
-The folder holds `detector.safetensors`, the weights, and `detector.json`, what it is and how far
-off it was on the demonstrations that were held out; the latter is written last.
+detector = load_detector(Path("outputs/detector"))
+places, confidences = detector.find(images, "front")
 """
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
@@ -19,46 +15,15 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from surgicai_vision.core.config import digest, from_mapping, to_mapping
-from surgicai_vision.core.errors import BadFile, InputError, check_name
-from surgicai_vision.core.files import read_json, write_bytes, write_json
+from surgicai_vision.core.config import digest, to_mapping
+from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.files import write_bytes, write_json
+from surgicai_vision.detection.card import CARD, WEIGHTS, DetectorCard, read_card
 from surgicai_vision.detection.network import JawNetwork, read_places
 from surgicai_vision.training.threads import one_thread
 
 if TYPE_CHECKING:
     from surgicai_vision.core.corruption import Image
-
-CARD = "detector.json"
-WEIGHTS = "detector.safetensors"
-FORMAT = 1
-
-
-@dataclass(frozen=True)
-class DetectorCard:
-    """What a detector is.
-
-    Attributes:
-        cameras: the cameras it knows, in the order of its last layer.
-        demos: hash of the demonstrations it was trained on.
-        images: number of images trained on.
-        epochs: passes over them.
-        seed: training seed.
-        errors: camera → median distance from the true place on held-out demonstrations, as a share
-            of the image's height.
-        code_version: version of the code that made it.
-        weights_sha256: hash of its weights.
-        format: version of this layout.
-    """
-
-    cameras: tuple[str, ...]
-    demos: str
-    images: int
-    epochs: int
-    seed: int
-    errors: Mapping[str, float]
-    code_version: str
-    weights_sha256: str = ""
-    format: int = FORMAT
 
 
 @final
@@ -110,29 +75,6 @@ def write_detector(folder: Path, card: DetectorCard, network: JawNetwork) -> Det
     return card
 
 
-def read_card(folder: Path) -> DetectorCard:
-    """Return what the detector in a folder is.
-
-    Raises:
-        BadFile: there is none, or its card is damaged or of another version.
-    """
-    path = Path(folder) / CARD
-    if not path.is_file():
-        raise BadFile(
-            f"{folder} is not a detector (no {CARD} in it); make one with "
-            "'surgicai-vision train-detector'."
-        )
-    plain = read_json(path)
-    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
-        raise BadFile(f"{path} is of another version; train the detector again.")
-    if plain.pop("card_sha256", None) != digest(plain):
-        raise BadFile(f"{path} was changed after training; train the detector again.")
-    try:
-        return from_mapping(DetectorCard, plain, str(path))
-    except (InputError, TypeError) as error:
-        raise BadFile(f"{path} is damaged ({error}); train the detector again.") from None
-
-
 def load_detector(folder: Path) -> Detector:
     """Return the detector in a folder, on the CPU.
 
@@ -150,9 +92,3 @@ def load_detector(folder: Path) -> Detector:
     except (OSError, SafetensorError, RuntimeError) as error:
         raise BadFile(f"{path} cannot be read ({error}); train the detector again.") from None
     return Detector(card, network)
-
-
-def check_cameras(card: DetectorCard, cameras: tuple[str, ...]) -> None:
-    """Raise `UnknownName` for a camera that the detector was not trained on."""
-    for camera in cameras:
-        check_name("camera of the detector", camera, card.cameras)

@@ -20,13 +20,8 @@ from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.executor import RunContext, building
 from surgicai_vision.core.files import check_output, code_version, whole_folder
 from surgicai_vision.demos.store import demos_digest, list_demos
-from surgicai_vision.detection.detector import (
-    CARD,
-    DetectorCard,
-    read_card,
-    tensor_of,
-    write_detector,
-)
+from surgicai_vision.detection.card import CARD, DetectorCard, read_card
+from surgicai_vision.detection.detector import tensor_of, write_detector
 from surgicai_vision.detection.examples import WHOLE, Examples, render_examples
 from surgicai_vision.detection.network import JawNetwork, loss, read_places
 from surgicai_vision.training.folder import read_state, write_state
@@ -142,7 +137,9 @@ class _Fit:
         self._cameras = cameras
         self._order = np.random.default_rng((seed, 1))
         torch.manual_seed(seed)
+        # In this layout, which `tensor_of` has, an update takes half the time on a CPU.
         self.network = JawNetwork(cameras)
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimiser = torch.optim.AdamW(
             self.network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY
         )

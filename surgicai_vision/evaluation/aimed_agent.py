@@ -22,7 +22,8 @@ from surgicai_vision.core import names
 from surgicai_vision.core.cameras import CAMERAS
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.lazy import LazyMapping
-from surgicai_vision.detection.detector import Detector, check_cameras, load_detector, read_card
+from surgicai_vision.detection.card import check_cameras, detector_folder, read_card
+from surgicai_vision.detection.detector import Detector, load_detector
 from surgicai_vision.detection.examples import PART, WHOLE
 from surgicai_vision.detection.network import SIZE
 from surgicai_vision.evaluation.agent import (
@@ -42,14 +43,19 @@ if TYPE_CHECKING:
     from surgicai_vision.evaluation.policy_spec import PolicySpec
 
 
-def aimed(spec: "PolicySpec", folder: Path) -> "PolicySpec":
-    """Return a policy whose crops lie where the detector in `folder` sees the jaws.
+def aimed(spec: "PolicySpec", detector: str | Path) -> "PolicySpec":
+    """Return a policy whose crops lie where a detector sees the jaws.
+
+    Args:
+        spec: what is evaluated.
+        detector: its folder, or `detection.card.RELEASED`.
 
     Raises:
         BadFile: the folder holds no detector, or a damaged one.
         UnknownName: the detector does not know a camera of the policy's crops.
         InputError: a policy with a view that is no crop.
     """
+    folder = detector_folder(detector)
     card = read_card(folder)
     views = spec.run.views
     lacking = [view for view in views if crop_of(view) is None]
@@ -64,7 +70,7 @@ def aimed(spec: "PolicySpec", folder: Path) -> "PolicySpec":
         spec,
         run=dataclasses.replace(spec.run, detector=card.weights_sha256),
         make=functools.partial(_make_aimed, spec.make, folder),
-        about={**spec.about, "detector": str(folder)},
+        about={**spec.about, "detector": str(detector)},
     )
 
 

@@ -157,6 +157,12 @@ def _check_condition(plan: "Plan", condition: Condition) -> None:
     check_at_least(1, **{f"condition {condition.name}: episodes": condition.episodes})
     _check_env(f"condition {condition.name}", {**plan.env, **condition.env}, "evaluated")
     plan.task_config(names.SUTURE, condition)
+    if condition.aimed:
+        for name in condition.policies or evaluated:
+            acting = plan.suture.values() if name == names.SUTURE else (plan.policy(name),)
+            for policy in acting:
+                for view in policy.view:
+                    check_name("crop that a detector can aim", view, names.CROPS)
     if condition.shift is not None:
         check_name("axis", condition.shift.axis, AXES)
         if not 0 <= condition.shift.strength <= 1:

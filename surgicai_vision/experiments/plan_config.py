@@ -342,6 +342,7 @@ class Plan:
                 starts=starts,
                 shift=condition.shift,
                 upset=condition.upset,
+                detector=condition.detector,
                 condition=condition.name,
             )
         training = self.training(self.policy(name), seed)
@@ -350,6 +351,7 @@ class Plan:
             evaluated_in(training, env, condition.shift),
             starts=starts,
             upset=condition.upset,
+            detector=condition.detector,
             condition=condition.name,
         )
 

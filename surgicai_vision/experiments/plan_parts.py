@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON
+from surgicai_vision.detection.card import RELEASED, detector_folder, read_card
 from surgicai_vision.evaluation.hierarchical_config import HLP
 from surgicai_vision.training.run_config import Shift
 
@@ -65,6 +66,7 @@ class Condition:
         seed: training seeds that are evaluated in it; all by default.
         episodes: number of starts; the plan's by default.
         shift: an axis of robustness (`evaluation.robustness.AXES`) and its strength, 0 to 1.
+        aimed: cut crops where the released detector sees the jaws (`evaluation.aimed_agent`).
     """
 
     name: str
@@ -75,6 +77,12 @@ class Condition:
     seed: tuple[int, ...] = ()
     episodes: int | None = None
     shift: Shift | None = None
+    aimed: bool = False
+
+    @property
+    def detector(self) -> str:
+        """Hash of the weights of the detector that aims crops; "" for none."""
+        return read_card(detector_folder(RELEASED)).weights_sha256 if self.aimed else ""
 
 
 @dataclass(frozen=True)

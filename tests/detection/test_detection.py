@@ -15,12 +15,8 @@ from surgicai_vision.core.corruption import CORRUPTIONS, Moment
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists
 from surgicai_vision.demos.record import record
 from surgicai_vision.detection import fit
-from surgicai_vision.detection.detector import (
-    CARD,
-    WEIGHTS,
-    load_detector,
-    tensor_of,
-)
+from surgicai_vision.detection.card import CARD, WEIGHTS
+from surgicai_vision.detection.detector import load_detector, tensor_of
 from surgicai_vision.detection.examples import WHOLE, render_examples
 from surgicai_vision.detection.network import (
     CELLS,

@@ -10,7 +10,8 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
-from surgicai_vision.detection.detector import DetectorCard, write_detector
+from surgicai_vision.detection.card import DetectorCard
+from surgicai_vision.detection.detector import write_detector
 from surgicai_vision.detection.examples import PART, WHOLE
 from surgicai_vision.detection.network import JawNetwork
 from surgicai_vision.envs.projection import jaws_in_image

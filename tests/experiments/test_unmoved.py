@@ -11,6 +11,7 @@ from surgicai_vision.commands.sweep import read_experiment
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RANDOMISATION_LIMITS
 from surgicai_vision.core.files import configs_folder
+from surgicai_vision.detection.card import RELEASED, detector_folder, read_card
 from surgicai_vision.envs.feasibility import refuse_impossible
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
 from surgicai_vision.features.encoders import OFFLINE_ENCODERS
@@ -66,6 +67,7 @@ def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
         "held-in looks",
         "held-out looks",
         "all axes at half strength",
+        "all axes at half strength, crops aimed",
         "needles never seen",
     )
     assert by_condition(UNMOVED) == dict.fromkeys(conditions, 2 * 6)  # `place` twice
@@ -83,7 +85,11 @@ def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
     differ = {key for key, value in vars(unseen).items() if vars(heldout)[key] != value}
     assert differ == {"needle_arc", "needle_size", "needle_thickness"}, "the needle alone"
     shifts = {run.condition: run.shift for run in UNMOVED.runs if run.shift}
-    assert shifts == {"all axes at half strength": HALF}
+    alike, aimed = shifts
+    assert shifts == {alike: HALF, aimed: HALF}
+    found = read_card(detector_folder(RELEASED)).weights_sha256
+    assert {run.detector for run in UNMOVED.runs if run.condition == aimed} == {found}
+    assert not any(run.detector for run in UNMOVED.runs if run.condition != aimed)
 
 
 @pytest.mark.parametrize("name", SWEEPS)

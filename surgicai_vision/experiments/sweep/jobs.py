@@ -17,6 +17,8 @@ from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Stage, silent_stage, timed
 from surgicai_vision.dataset import Dataset, RenderedDataset, open_dataset
 from surgicai_vision.dataset.subset import of_subtask
+from surgicai_vision.detection.card import RELEASED
+from surgicai_vision.evaluation.aimed_agent import aimed
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import (
     PolicySpec,
@@ -118,7 +120,10 @@ def train_and_evaluate(
         else:
             spec = _trained(what, _dataset(dataset), folder / "policy", measured, weights, device)
             about["folder"] = str(Path(final) / "policy")
-        spec = _shifted(in_env(spec, env), what)
+        spec = in_env(spec, env)
+        if what.detector:
+            spec = aimed(spec, RELEASED)
+        spec = _shifted(spec, what)
         about = {**spec.about, **about}
         with measured("evaluation", "steps"):
             summary = evaluate_as(folder / "evaluation", spec, what, about, processes)
