@@ -42,6 +42,8 @@ class Condition:
         recipe: the recipe's name, or the path of its file.
         changes: what is changed in the recipe.
         acted_by: what is changed in the recipe for the evaluation only.
+        aimed: the detector that aims its crops, by the first digits of its hash; "" if they lie
+            where the arm reports its jaws.
         demonstrations: demonstrations trained on, validation included; None if not known.
         looks: the looks in which each demonstration was rendered, or "".
         multiplied_from: how many demonstrations those were re-posed from; None if they were not.
@@ -76,6 +78,7 @@ class Condition:
     recipe: str = "paper"
     changes: tuple[str, ...] = ()
     acted_by: tuple[str, ...] = ()
+    aimed: str = ""
     demonstrations: int | None = None
     looks: str = ""
     multiplied_from: int | None = None
@@ -115,6 +118,7 @@ class Condition:
             *dict.fromkeys(part for part, common in usual if part != common),
             " + ".join(self.changes),
             f"acting by {' + '.join(self.acted_by)}" if self.acted_by else "",
+            f"crops aimed by detector {self.aimed}" if self.aimed else "",
             *self.amounts,
             *self.surroundings,
             self.place,
@@ -240,6 +244,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         recipe=run.recipe,
         changes=run.changes,
         acted_by=run.acted_by,
+        aimed=run.detector[:8],
         demonstrations=run.demonstrations,
         looks=run.variants.text if run.variants else "",
         multiplied_from=run.multiplied_from,

@@ -35,6 +35,7 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "recipe": "recipe",
         "changes": "change",
         "acted_by": "change in acting",
+        "aimed": "aim of the crops",
         "demonstrations": "demonstrations",
         "looks": "looks",
         "multiplied_from": "multiplied demonstrations",
@@ -57,7 +58,7 @@ DEMONSTRATED = ("demonstrations", "demonstrator", "noise", "post_success_steps")
 """Fields that say what was demonstrated, by whom and how."""
 OF_RECIPES = ("encoder", "views", "pool", "changes", "budget", *DEMONSTRATED)
 OF_KINDS = ("recipe", "changes")
-OF_CONDITIONS = ("hierarchical", "world", "rules")
+OF_CONDITIONS = ("hierarchical", "aimed", "world", "rules")
 """What belongs to a recipe, to a kind of policy, and to a condition of a plan."""
 
 

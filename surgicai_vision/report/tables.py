@@ -7,6 +7,7 @@ evaluated, has our numbers next to those of the paper's tables 1 and 4.
 
 import csv
 import io
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -138,10 +139,10 @@ def evaluate_command(result: Result) -> str | None:
     if result.run.acted_by or result.config != result.own_env:
         return None
     ending = f"--task {result.summary['task']} --episodes {len(seeds)} --seed {seeds[0]} --json"
+    if result.run.detector:
+        ending = f"--detector {shlex.quote(str(about['detector']))} {ending}"
     name = result.summary["policy"]
     if about.get("folder"):
-        import shlex
-
         return f"surgicai-vision evaluate {shlex.quote(str(about['folder']))} {ending}"
     return f"surgicai-vision evaluate {name} {ending}" if name in REFERENCES[:3] else None
 

@@ -44,6 +44,8 @@ def test_an_aimed_condition_is_evaluated_with_the_released_detector(tmp_path):
     assert (stored["as reported"].detector, stored["aimed"].detector) == ("", found)
     assert f"aimed-{found[:8]}" in stored["aimed"].name
     groups = group(collect(out))
+    labels = sorted(item.label for item in groups)
+    assert [f"aimed by detector {found[:8]}" in label for label in labels] == [False, True]
     assert {pair.factor for pair in compare(groups)} == {"condition"}
 
 

@@ -388,11 +388,13 @@ def test_a_command_repeats_only_what_it_says(tmp_path):
         "moved": evaluated_in(plain, TaskConfig("grasp", randomisation=moved)),
         "short": replace(plain, env=TaskConfig("grasp", max_steps=50)),
         "acting": replace(plain, acted_by=("execute=5",)),
+        "aimed": replace(plain, detector="12345678abcd"),
         "expert": EXPERT,
         "soft": replace(EXPERT, env=TaskConfig("grasp", SceneConfig(tissue="soft"))),
     }
     for name, run in runs.items():
         about = {"folder": folder} if run.is_trained else {}
+        about |= {"detector": "my detector"} if run.detector else {}
         evaluation(tmp_path / "out" / name, run, 0.5, generator, about)
     starts = "--task grasp --episodes 20 --seed 900000 --json"
     assert {
@@ -401,6 +403,7 @@ def test_a_command_repeats_only_what_it_says(tmp_path):
     } == {
         **dict.fromkeys(runs),
         "plain": f"surgicai-vision evaluate {folder} {starts}",
+        "aimed": f"surgicai-vision evaluate {folder} --detector 'my detector' {starts}",
         "expert": f"surgicai-vision evaluate expert {starts}",
     }
 

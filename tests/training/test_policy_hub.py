@@ -183,6 +183,7 @@ def test_successes_are_counted_from_the_episodes_of_this_policy(
         ({"env": TaskConfig("grasp", scene=SceneConfig(grasp="attach"))}, "world or rules"),
         ({"shift": Shift("light", 0.5)}, "a shift"),
         ({"upset": True}, "upset on purpose"),
+        ({"detector": "12345678"}, "aimed by a detector"),
         ({"acted_by": ("samples=8",)}, "settings of acting"),
     ],
 )

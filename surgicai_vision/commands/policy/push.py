@@ -106,6 +106,7 @@ def _successes(folder: Path, checkpoint: "Checkpoint") -> "Successes":
         "a shift": run.shift is not None,
         "episodes that were upset on purpose": run.upset,
         "other settings of acting": bool(run.acted_by),
+        "crops aimed by a detector": bool(run.detector),
     }
     wrong = [what for what, holds in other.items() if holds]
     if wrong:
