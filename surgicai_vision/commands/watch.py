@@ -13,6 +13,7 @@ from surgicai_vision.commands.options import (
     VIEWS,
     AcceptLicence,
     DatasetFolder,
+    DetectorName,
     EnvFields,
     PolicyName,
     PolicyTask,
@@ -55,6 +56,8 @@ class Options:
         view: Views to show initially; the first is the leading view.
         size: Height and width of images [px].
         dataset: With policy replay, the dataset whose mean demonstration it plays.
+        detector: Folder of a detector, or released:detector; crops are then cut where it sees the
+            jaws (docs/detection.md).
         expert_swap: For a hierarchical policy, the subtask in which the expert acts instead.
     """
 
@@ -71,6 +74,7 @@ class Options:
     dataset: DatasetFolder = None
     weights: WeightFiles = ()
     accept_licence: AcceptLicence = False
+    detector: DetectorName = None
     expert_swap: Annotated[str | None, Parameter(choices=names.SUBTASKS, metavar="SUBTASK")] = None
     env: EnvFields = None
 
@@ -94,6 +98,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         options.dataset,
         WeightsSource.parse(options.weights, options.accept_licence),
         options.expert_swap,
+        detector=options.detector,
     )
 
     def tell(row: "EpisodeMetrics") -> None:
