@@ -22,8 +22,7 @@ from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskCo
 from surgicai_vision.core.corruption import CORRUPTIONS, Image, Moment
 from surgicai_vision.detection.card import RELEASED, detector_folder
 from surgicai_vision.detection.detector import load_detector
-from surgicai_vision.detection.example_jobs import shrunk
-from surgicai_vision.detection.examples import PART, WHOLE
+from surgicai_vision.detection.examples import PART, WHOLE, shrunk
 from surgicai_vision.envs.projection import jaws_in_image
 from surgicai_vision.evaluation.aimed_agent import cut
 from surgicai_vision.evaluation.robustness import AXES

@@ -12,7 +12,7 @@ from surgicai_vision.commands.options import COUNT, DIRECTORY, EXECUTOR, LIST, S
 from surgicai_vision.core.cameras import check_camera
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.words import plural
-from surgicai_vision.detection.card import CARD
+from surgicai_vision.detection.card import CAMERAS, CARD, EPOCHS, PER_DEMO
 
 app = App(
     name="train-detector",
@@ -40,12 +40,9 @@ class Options:
     """
 
     demos: Annotated[tuple[Path, ...], Parameter(metavar="DIR[,DIR]")]
-    camera: Annotated[tuple[str, ...], LIST, Parameter(metavar="CAMERA[,CAMERA]")] = (
-        "front",
-        "back",
-    )
-    per_demo: Annotated[int, COUNT] = 12
-    epochs: Annotated[int, COUNT] = 10
+    camera: Annotated[tuple[str, ...], LIST, Parameter(metavar="CAMERA[,CAMERA]")] = CAMERAS
+    per_demo: Annotated[int, COUNT] = PER_DEMO
+    epochs: Annotated[int, COUNT] = EPOCHS
     seed: Annotated[int, SEED] = 0
     workers: Annotated[int, COUNT] = folders.CORES
     executor: Annotated[str, EXECUTOR] = "local"

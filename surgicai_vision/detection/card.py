@@ -15,6 +15,10 @@ from surgicai_vision.core.files import PACKAGE, read_json
 CARD = "detector.json"
 WEIGHTS = "detector.safetensors"
 FORMAT = 1
+CAMERAS = ("front", "back")
+PER_DEMO = 12
+EPOCHS = 10
+"""What a training takes by default: cameras, states of each demonstration, passes over them."""
 RELEASED = "released:detector"
 """Name of the detector that comes with the product."""
 

@@ -10,7 +10,6 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
@@ -23,8 +22,7 @@ from surgicai_vision.core.corruption import CORRUPTIONS, Image, Moment
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import write_bytes
 from surgicai_vision.demos.store import read_demo
-from surgicai_vision.detection.examples import EXAMPLES_FILE, PART, WHOLE, WORLD
-from surgicai_vision.detection.network import SIZE
+from surgicai_vision.detection.examples import EXAMPLES_FILE, PART, WHOLE, WORLD, shrunk
 from surgicai_vision.envs import randomisation
 from surgicai_vision.envs.projection import jaws_in_image
 
@@ -87,9 +85,3 @@ def render_examples(folder: Path, demo: str, cameras: Sequence[str], count: int)
         "places": np.array(places, np.float32),
     }
     write_bytes(folder / EXAMPLES_FILE, save(content))
-
-
-def shrunk(image: Image) -> NDArray[np.uint8]:
-    """Return a whole image at the size of the network's input, each pixel a mean of pixels."""
-    small = cv2.resize(image, SIZE[::-1], interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8)

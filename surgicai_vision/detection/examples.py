@@ -15,12 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON
+from surgicai_vision.core.corruption import Image
 from surgicai_vision.core.executor import Job, RunContext, register_job, run
 from surgicai_vision.core.files import sha256_file
 from surgicai_vision.core.progress import Progress, silent
@@ -28,6 +30,8 @@ from surgicai_vision.core.progress import Progress, silent
 EXAMPLES_FILE = "examples.safetensors"
 WHOLE = (480, 640)
 """Height and width of a whole image [pixel], as SurgicAI's cameras have them."""
+SIZE = (120, 160)
+"""Height and width of the network's input [pixel]."""
 WORLD: Mapping[str, JSON] = MappingProxyType(
     {
         "camera_shift": 10.0,
@@ -108,3 +112,9 @@ def render_examples(
         np.tile(np.arange(len(cameras)), len(images)),
         np.repeat(np.arange(len(shards)), np.array(counts) * len(cameras)),
     )
+
+
+def shrunk(image: Image) -> NDArray[np.uint8]:
+    """Return a whole image at the size of the network's input, each pixel a mean of pixels."""
+    small = cv2.resize(image, SIZE[::-1], interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)

@@ -17,19 +17,23 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError, OutputExists
-from surgicai_vision.core.executor import RunContext, building
+from surgicai_vision.core.executor import RunContext, building, claim
 from surgicai_vision.core.files import check_output, code_version, whole_folder
 from surgicai_vision.demos.store import demos_digest, list_demos
-from surgicai_vision.detection.card import CARD, DetectorCard, read_card
+from surgicai_vision.detection.card import (
+    CAMERAS,
+    CARD,
+    EPOCHS,
+    PER_DEMO,
+    DetectorCard,
+    read_card,
+)
 from surgicai_vision.detection.detector import tensor_of, write_detector
 from surgicai_vision.detection.examples import WHOLE, Examples, render_examples
 from surgicai_vision.detection.network import JawNetwork, loss, read_places
 from surgicai_vision.training.folder import read_state, write_state
 from surgicai_vision.training.threads import one_thread
 
-CAMERAS = ("front", "back")
-EPOCHS = 12
-PER_DEMO = 14
 BATCH = 64
 LEARNING_RATE = 0.003
 """The peak of a cycle."""
@@ -60,9 +64,11 @@ def train_detector(
         context: workers, engine and display.
 
     Raises:
-        InputError: fewer than two demonstrations.
+        InputError: fewer than two demonstrations, or a folder given twice.
         OutputExists: `out` holds something else.
     """
+    if len({folder.resolve() for folder in demos}) < len(demos):
+        raise InputError("A folder of demonstrations is given twice; give each folder once.")
     paths = [path for folder in demos for path in list_demos(folder)]
     if len(paths) < 2:
         raise InputError(
@@ -79,7 +85,7 @@ def train_detector(
             )
         return card
     check_output(out)
-    with building(out) as (store, result):
+    with building(out) as (store, result), claim(store):
         with context.stage(f"examples: {', '.join(cameras)}", "images") as progress:
             examples = render_examples(paths, store, cameras, per_demo, context, progress)
         request: dict[str, JSON] = {
@@ -118,8 +124,8 @@ class _Fit:
     """One training: its examples, its network, its optimiser.
 
     Args:
-        examples: all of them; those of the last demonstrations of each folder's order are not
-            trained on.
+        examples: all of them; those of a random `HELD_OUT` of the demonstrations are not trained
+            on.
         cameras: number of cameras.
         epochs: passes over the images.
         seed: training seed.

@@ -13,8 +13,6 @@ from torch import nn
 
 from surgicai_vision.core import names
 
-SIZE = (120, 160)
-"""Height and width of the input [pixel]: a quarter of SurgicAI's 480 × 640."""
 CELLS = (60, 80)
 """Rows and columns of the answer: a cell is about 1.6 mm at the holes in "front" and "back"."""
 SPREAD = 1.0

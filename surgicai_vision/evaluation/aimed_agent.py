@@ -10,6 +10,7 @@ wraps is unchanged. Inputs other than images still come from the reported joints
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, final
@@ -24,8 +25,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.detection.card import check_cameras, detector_folder, read_card
 from surgicai_vision.detection.detector import Detector, load_detector
-from surgicai_vision.detection.examples import PART, WHOLE
-from surgicai_vision.detection.network import SIZE
+from surgicai_vision.detection.examples import PART, WHOLE, shrunk
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
@@ -53,7 +53,7 @@ def aimed(spec: "PolicySpec", detector: str | Path) -> "PolicySpec":
     Raises:
         BadFile: the folder holds no detector, or a damaged one.
         UnknownName: the detector does not know a camera of the policy's crops.
-        InputError: a policy with a view that is no crop.
+        InputError: a policy with a view that is no crop, or a crop of an image that is not 4:3.
     """
     folder = detector_folder(detector)
     card = read_card(folder)
@@ -64,7 +64,14 @@ def aimed(spec: "PolicySpec", detector: str | Path) -> "PolicySpec":
             f"A detector aims crops, and {spec.name} sees {', '.join(lacking) or 'no images'}; "
             "give a policy whose views are all crops, such as front_psm2."
         )
-    check_cameras(card, tuple(dict.fromkeys(_crop(view).camera for view in views)))
+    crops = [_crop(view) for view in views]
+    check_cameras(card, tuple(dict.fromkeys(crop.camera for crop in crops)))
+    for crop in crops:
+        if not math.isclose(crop.aspect, WHOLE[1] / WHOLE[0]):
+            raise InputError(
+                f"The image of '{crop.camera}' is {crop.aspect:g} times as wide as high, and a "
+                f"detector sees {WHOLE[0]} × {WHOLE[1]}; give a policy with crops of such cameras."
+            )
     load_detector(folder)
     return dataclasses.replace(
         spec,
@@ -147,8 +154,7 @@ class AimedAgent(Agent):
 
     def _find(self, observation: Observation, camera: str) -> NDArray[np.float32]:
         """Return where a camera shows both arms' jaws, (2, 2), shares of width and height."""
-        small = cv2.resize(_whole(observation, camera), SIZE[::-1], interpolation=cv2.INTER_AREA)
-        places, _ = self._detector.find(np.asarray(small, np.uint8)[None], camera)
+        places, _ = self._detector.find(shrunk(_whole(observation, camera))[None], camera)
         found: NDArray[np.float32] = places[0]
         return found
 

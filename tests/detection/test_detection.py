@@ -17,10 +17,9 @@ from surgicai_vision.demos.record import record
 from surgicai_vision.detection import fit
 from surgicai_vision.detection.card import CARD, WEIGHTS
 from surgicai_vision.detection.detector import load_detector, tensor_of
-from surgicai_vision.detection.examples import WHOLE, render_examples
+from surgicai_vision.detection.examples import SIZE, WHOLE, render_examples
 from surgicai_vision.detection.network import (
     CELLS,
-    SIZE,
     JawNetwork,
     _centres,
     _in_cells,
@@ -232,9 +231,11 @@ def test_the_command_trains_and_says_how_far_off_it_is(demos, tmp_path, capsys):
         (["--camera", "frnt"], "front"),
         (["--demos", "nowhere"], "nowhere"),
         (["--epochs", "0"], "epochs"),
+        (["--demos", "DEMOS,DEMOS"], "given twice"),
     ],
 )
 def test_wrong_input_is_refused_in_one_line(demos, tmp_path, capsys, words, message):
+    words = [word.replace("DEMOS", str(demos)) for word in words]
     given = words if "--demos" in words else ["--demos", str(demos), *words]
     assert main(["train-detector", *given, "--out", str(tmp_path / "detector")]) == 2
     said = capsys.readouterr().err.strip()

@@ -10,8 +10,7 @@ from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.corruption import CORRUPTIONS, Moment
 from surgicai_vision.detection.card import RELEASED, detector_folder
 from surgicai_vision.detection.detector import load_detector
-from surgicai_vision.detection.example_jobs import shrunk
-from surgicai_vision.detection.examples import PART, WHOLE
+from surgicai_vision.detection.examples import PART, WHOLE, shrunk
 from surgicai_vision.envs.projection import jaws_in_image
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
 

@@ -49,7 +49,7 @@ LEARN = (
     "encoders",
     "policies",
 )
-EVALUATE = (*LEARN, "evaluation")
+EVALUATE = (*LEARN, "detection", "evaluation")
 RL = ("scene", "envs", "demos", "training", "experiments", "policies", "evaluation", "rl")
 PACKAGES = ("mujoco", "numpy", "torch", "timm", "lerobot")
 RL_PACKAGES = ("mujoco", "numpy", "torch", "stable-baselines3", "sb3-contrib", "d3rlpy")
