@@ -147,7 +147,7 @@ def test_what_cannot_be_aimed_is_refused(folder, tmp_path):
         aimed(spec_of(("endo_left_psm2",)), folder)
     card = DetectorCard(("endo_left",), "", 0, 0, 0, {"endo_left": 0.0}, "")
     write_detector(tmp_path / "endoscope", card, JawNetwork(1))
-    with pytest.raises(InputError, match="1.25 times as wide"):
+    with pytest.raises(InputError, match="times as wide as high"):
         aimed(spec_of(("endo_left_psm2",)), tmp_path / "endoscope")
     with pytest.raises(BadFile, match="train-detector"):
         aimed(spec_of(), tmp_path)
