@@ -11,6 +11,7 @@ from pathlib import Path
 from surgicai_vision.core.config import digest, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.files import PACKAGE, read_json
+from surgicai_vision.training.released import is_released
 
 CARD = "detector.json"
 WEIGHTS = "detector.safetensors"
@@ -52,8 +53,15 @@ class DetectorCard:
 
 
 def detector_folder(given: str | Path) -> Path:
-    """Return the folder of a detector: that of `RELEASED`, or the given one."""
-    return PACKAGE / "released" / "detector" if str(given) == RELEASED else Path(given)
+    """Return the folder of a detector: that of `RELEASED`, or the given one.
+
+    Raises:
+        UnknownName: another name than `RELEASED` with its prefix.
+    """
+    if not is_released(given):
+        return Path(given)
+    check_name("released detector", str(given), (RELEASED,))
+    return PACKAGE / "released" / "detector"
 
 
 def read_card(folder: Path) -> DetectorCard:

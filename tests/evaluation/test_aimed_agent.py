@@ -151,6 +151,8 @@ def test_what_cannot_be_aimed_is_refused(folder, tmp_path):
         aimed(spec_of(("endo_left_psm2",)), tmp_path / "endoscope")
     with pytest.raises(BadFile, match="train-detector"):
         aimed(spec_of(), tmp_path)
+    with pytest.raises(UnknownName, match="Did you mean 'released:detector'"):
+        aimed(spec_of(), "released:detectr")
 
 
 @pytest.mark.parametrize("command", ["evaluate", "robustness"])
