@@ -431,7 +431,8 @@ class Plan:
         """Return True if `stored` is this plan, but lacks some training seeds or conditions."""
         other = plan_of(stored, "the stored plan")
         return (
-            to_mapping(replace(self, seed=other.seed, conditions=other.conditions)) == stored
+            to_mapping(replace(self, seed=other.seed, conditions=other.conditions))
+            == to_mapping(other)
             and set(other.seed) <= set(self.seed)
             and all(condition in self.conditions for condition in other.conditions)
         )

@@ -123,7 +123,11 @@ class Row:
 
     def sealed(self) -> "Row":
         """Return the row with the digest of its content."""
-        return replace(self, digest=digest(to_mapping(replace(self, digest=""))))
+        content = to_mapping(replace(self, digest=""))
+        run = to_mapping(self.run)
+        if not self.run.detector:  # rows that were sealed before it existed keep their digest
+            del run["detector"]
+        return replace(self, digest=digest({**content, "run": run}))
 
 
 @dataclass(frozen=True)

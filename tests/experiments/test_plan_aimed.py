@@ -1,5 +1,7 @@
 """Conditions of a plan whose crops a detector aims, tiny, end to end."""
 
+import json
+
 import pytest
 
 from surgicai_vision.commands.console import QuietConsole
@@ -54,6 +56,15 @@ def test_a_condition_without_a_detector_keeps_its_key():
     keys = {run.condition: run_key(run) for run in plan_of(TABLE, "a test").runs}
     assert [run_key(run) for run in plan_of(plain, "a test").runs] == [keys["as reported"]]
     assert keys["aimed"] != keys["as reported"]
+
+
+def test_a_sweep_stored_before_conditions_could_be_aimed_is_continued():
+    plain = plan_of({**TABLE, "conditions": TABLE["conditions"][:1]}, "a test")
+    stored = json.loads(json.dumps(plain.table()))
+    for condition in stored["conditions"]:
+        del condition["aimed"]
+    assert plan_of(TABLE, "a test").extends(stored)
+    assert not plan_of({**TABLE, "size": 64}, "a test").extends(stored)
 
 
 def test_whole_images_cannot_be_aimed():
