@@ -18,53 +18,42 @@ import numpy as np
 from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_number
-from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig
-from surgicai_vision.core.corruption import CORRUPTIONS, Image, Moment
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.corruption import Image, Moment, spoilt
+from surgicai_vision.core.files import configs_folder
 from surgicai_vision.detection.card import RELEASED, detector_folder
 from surgicai_vision.detection.detector import load_detector
-from surgicai_vision.detection.examples import PART, WHOLE, shrunk
+from surgicai_vision.detection.examples import PART, WHOLE, are_shown, distances, shrunk
 from surgicai_vision.envs.projection import jaws_in_image
 from surgicai_vision.evaluation.aimed_agent import cut
 from surgicai_vision.evaluation.robustness import AXES
 from surgicai_vision.evaluation.robustness.axes import shifted_config
+from surgicai_vision.experiments.plan_config import read_plan
 from surgicai_vision.scene.cameras import crop_of
 
-WIDENED = RandomisationConfig(
-    phantom_shift=10,
-    phantom_turn=15,
-    pair="any",
-    robot_start=15,
-    needle_size=0.06,
-    needle_arc="train",
-    needle_thickness=0.15,
-    appearance="train",
-)
 SIDE = 224
 """Height and width of a crop [pixel]."""
 HEIGHT = {"front": 96.0, "back": 105.0}
 """Height of what a camera shows at the holes [mm]."""
 WORLDS = (("", 0.0), ("heldout", 0.0), ("camera", 0.5), ("camera", 1.0), ("all", 0.5))
 """Axis of `robustness` ("heldout": looks of held-out families) and its strength."""
-
-
 SHOWN = (("camera", 500_001), ("all", 500_004), ("all", 500_011))
 """Axis at half strength and start of each row of the sheet."""
 
 
 def world(task: str, axis: str, strength: float) -> TaskConfig:
     """Return the widened world of a task with an axis off."""
-    plain = TaskConfig(task, scene=SceneConfig(ink="due"), randomisation=WIDENED)
+    plain = read_plan(configs_folder() / "sweep" / "unmoved.yaml").task_config(task)
     if axis == "heldout":
-        looks = dataclasses.replace(WIDENED, appearance="heldout")
+        looks = dataclasses.replace(plain.randomisation, appearance=names.HELDOUT)
         return dataclasses.replace(plain, randomisation=looks)
     return shifted_config(plain, AXES[axis], strength) if axis else plain
 
 
-def spoilt(image: Image, axis: str, strength: float, moment: Moment) -> Image:
+def corrupted(image: Image, axis: str, strength: float, moment: Moment) -> Image:
     """Return an image as the axis spoils it."""
-    for kind in AXES[axis].images if axis in AXES else ():
-        image = CORRUPTIONS[kind](image, strength, moment)
-    return image
+    kinds = AXES[axis].images if axis in AXES else ()
+    return spoilt(image, dict.fromkeys(kinds, strength), moment)
 
 
 def errors(options: argparse.Namespace, axis: str, strength: float) -> dict[str, list[float]]:
@@ -78,12 +67,11 @@ def errors(options: argparse.Namespace, axis: str, strength: float) -> dict[str,
         for camera, height in HEIGHT.items():
             moment = Moment(seed, 0, camera_number(camera), PART)
             whole = env.image(camera, WHOLE).astype(np.uint8)
-            image = spoilt(whole, axis, strength, moment)
+            image = corrupted(whole, axis, strength, moment)
             places, _ = detector.find(shrunk(image)[None], camera)
             true = np.array(jaws_in_image(env.simulation, camera, options.arm, WHOLE))
-            if ((true >= 0) & (true <= 1)).all():
-                off = (places[0, arm] - true) * (WHOLE[1] / WHOLE[0], 1.0) * height
-                found[camera].append(float(np.linalg.norm(off)))
+            if are_shown(true):
+                found[camera].append(float(distances(places[0, arm], true)) * height)
     env.close()
     return found
 
@@ -101,7 +89,7 @@ def write_sheet(options: argparse.Namespace) -> None:
             view = f"{camera}_{options.arm}"
             number = camera_number(camera)
             image = env.image(camera, WHOLE).astype(np.uint8)
-            image = spoilt(image, axis, 0.5, Moment(seed, 0, number, PART))
+            image = corrupted(image, axis, 0.5, Moment(seed, 0, number, PART))
             reported = env.image(view, (SIDE, SIDE)).astype(np.uint8)
             places, _ = detector.find(shrunk(image)[None], camera)
             place = places[0, names.ARMS.index(options.arm)]
@@ -115,7 +103,7 @@ def write_sheet(options: argparse.Namespace) -> None:
             cv2.rectangle(marked, (left, top), (left + side, top + side), (255, 60, 60), 3)
             row += [
                 cv2.resize(marked, (SIDE * width // height, SIDE), interpolation=cv2.INTER_AREA),
-                spoilt(reported, axis, 0.5, Moment(seed, 0, number)),
+                corrupted(reported, axis, 0.5, Moment(seed, 0, number)),
                 cut(image, crop, place, SIDE),
             ]
         framed = [np.pad(each, ((2, 2), (2, 2), (0, 0)), constant_values=255) for each in row]

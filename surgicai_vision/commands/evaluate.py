@@ -65,8 +65,6 @@ class Options:
         dataset: With policy replay, the dataset whose mean demonstration it plays.
         change: For a policy that plans chunks, values of execute, samples and ensemble to use
             instead of its recipe's.
-        detector: Folder of a detector, or released:detector; crops are then cut where it sees the
-            jaws (docs/detection.md).
         expert_swap: For a hierarchical policy, the subtask in which the expert acts instead; all
             takes each subtask in turn.
         upset: Make one thing go wrong in every episode, drawn by its start's seed: the needle is

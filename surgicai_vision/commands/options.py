@@ -146,7 +146,11 @@ EvaluationWorkers = Annotated[
 ]
 DetectorName = Annotated[
     str | None,
-    Parameter(metavar="DIR"),
+    Parameter(
+        help="Folder of a detector, or released:detector; crops are then cut where it sees the "
+        "jaws (docs/detection.md).",
+        metavar="DIR",
+    ),
     default_text("none: crops lie where the arm reports its jaws"),
 ]
 DatasetFolder = Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")]

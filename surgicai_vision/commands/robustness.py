@@ -50,8 +50,6 @@ class Options:
         strength: Strengths of the shift, from 0 (none) to 1, increasing.
         episodes: Number of episodes at each strength.
         seed: Seed of the first start; each episode takes the next.
-        detector: Folder of a detector, or released:detector; crops are then cut where it sees the
-            jaws (docs/detection.md).
         workers: Number of processes.
         dataset: With policy replay, the dataset whose mean demonstration it plays.
         out: Folder to create or continue.

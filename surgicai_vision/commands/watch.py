@@ -56,8 +56,6 @@ class Options:
         view: Views to show initially; the first is the leading view.
         size: Height and width of images [px].
         dataset: With policy replay, the dataset whose mean demonstration it plays.
-        detector: Folder of a detector, or released:detector; crops are then cut where it sees the
-            jaws (docs/detection.md).
         expert_swap: For a hierarchical policy, the subtask in which the expert acts instead.
     """
 

@@ -101,3 +101,10 @@ Change = Callable[[Image, float, Moment], Image]
 """(image, strength, moment) → the corrupted image."""
 CORRUPTIONS: Mapping[str, Change] = MappingProxyType({"smoke": smoke, "blur": blur, "noise": noise})
 """Name → corruption, in the order in which they are applied to an image."""
+
+
+def spoilt(image: Image, strengths: Mapping[str, float], moment: Moment) -> Image:
+    """Return an image after several corruptions: name → strength, in the order of application."""
+    for kind, strength in strengths.items():
+        image = CORRUPTIONS[kind](image, strength, moment)
+    return image

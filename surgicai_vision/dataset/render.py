@@ -35,7 +35,14 @@ from surgicai_vision.dataset.layouts import LAYOUTS, SURGICAI
 from surgicai_vision.dataset.reader import open_dataset
 from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.writer import SUMMARY_FILE, assemble
-from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo, read_marker
+from surgicai_vision.demos.store import (
+    Demo,
+    demos_digest,
+    distinct_folders,
+    list_demos,
+    read_demo,
+    read_marker,
+)
 
 register_job(
     "render-episode",
@@ -92,7 +99,7 @@ def render_demos(
     chosen = LAYOUTS[layout]
     views = views or chosen.views
     check_output(out, may_resume=names.META_FILE)
-    sources = _distinct([demos] if isinstance(demos, Path) else demos)
+    sources = distinct_folders([demos] if isinstance(demos, Path) else demos)
     paths = [path for source in sources for path in list_demos(source)]
     options: dict[str, JSON] = {
         "views": list(views),
@@ -145,18 +152,6 @@ def check_request(
     _check_images(views or chosen.views, size, video)
     check_frame_stride(frame_stride)
     _check_layout(layout, frame_stride, video)
-
-
-def _distinct(folders: Sequence[Path]) -> list[Path]:
-    """Return the folders of demonstrations; refuse one that is given twice."""
-    known: set[Path] = set()
-    for folder in folders:
-        if folder.resolve() in known:
-            raise InputError(
-                f"The demonstrations in {folder} are given twice; give each folder once."
-            )
-        known.add(folder.resolve())
-    return list(folders)
 
 
 def _job(path: Path, options: Mapping[str, JSON], frames: int) -> Job:

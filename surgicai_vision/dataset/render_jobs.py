@@ -22,7 +22,7 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
-from surgicai_vision.core.corruption import CORRUPTIONS, Image, Moment
+from surgicai_vision.core.corruption import CORRUPTIONS, Image, Moment, spoilt
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import write_json
 from surgicai_vision.core.variants import Variants
@@ -173,10 +173,7 @@ class _Shown:
 
     def spoilt(self, image: Image, step: int, view: str) -> Image:
         """Return an image (height, width, 3) after the corruptions of a control step."""
-        moment = Moment(self.seed, step, camera_number(view))
-        for kind, strength in self.strengths.items():
-            image = CORRUPTIONS[kind](image, strength, moment)
-        return image
+        return spoilt(image, self.strengths, Moment(self.seed, step, camera_number(view)))
 
 
 def _write_episode(

@@ -10,7 +10,7 @@ damaged file raises `BadFile`.
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -296,3 +296,15 @@ def first_demos(folder: Path, count: int | None) -> list[Path]:
 def demos_digest(paths: list[Path]) -> str:
     """Return the sha256 over the episodes' files, in order."""
     return digest([sha256_file(path) for path in paths])
+
+
+def distinct_folders(folders: Sequence[Path]) -> list[Path]:
+    """Return the folders of demonstrations; refuse one that is given twice."""
+    known: set[Path] = set()
+    for folder in folders:
+        if folder.resolve() in known:
+            raise InputError(
+                f"The demonstrations in {folder} are given twice; give each folder once."
+            )
+        known.add(folder.resolve())
+    return list(folders)

@@ -18,7 +18,7 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig, from_mapping, to_mapping
-from surgicai_vision.core.corruption import CORRUPTIONS, Image, Moment
+from surgicai_vision.core.corruption import CORRUPTIONS, Image, Moment, spoilt
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import write_bytes
 from surgicai_vision.demos.store import read_demo
@@ -74,9 +74,7 @@ def render_examples(folder: Path, demo: str, cameras: Sequence[str], count: int)
             }
             image = env.image(camera, WHOLE).astype(np.uint8, copy=False)
             moment = Moment(seed, index, camera_number(camera), PART)
-            for kind, strength in strengths.items():
-                image = CORRUPTIONS[kind](image, strength, moment)
-            images[-1].append(shrunk(image))
+            images[-1].append(shrunk(spoilt(image, strengths, moment)))
             places[-1].append(
                 [jaws_in_image(env.simulation, camera, arm, WHOLE) for arm in names.ARMS]
             )

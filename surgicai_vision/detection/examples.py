@@ -118,3 +118,16 @@ def shrunk(image: Image) -> NDArray[np.uint8]:
     """Return a whole image at the size of the network's input, each pixel a mean of pixels."""
     small = cv2.resize(image, SIZE[::-1], interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8)
+
+
+def are_shown(places: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return which places (…, 2) lie within the image, (…)."""
+    shown: NDArray[np.bool_] = np.asarray(((places >= 0) & (places <= 1)).all(axis=-1))
+    return shown
+
+
+def distances(found: NDArray[np.floating], true: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return how far places (…, 2) are from the true ones, as shares of the image's height (…)."""
+    height, width = WHOLE
+    off: NDArray[np.floating] = np.linalg.norm((found - true) * (width / height, 1.0), axis=-1)
+    return off

@@ -19,7 +19,7 @@ from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.executor import RunContext, building, claim
 from surgicai_vision.core.files import check_output, code_version, whole_folder
-from surgicai_vision.demos.store import demos_digest, list_demos
+from surgicai_vision.demos.store import demos_digest, distinct_folders, list_demos
 from surgicai_vision.detection.card import (
     CAMERAS,
     CARD,
@@ -29,7 +29,7 @@ from surgicai_vision.detection.card import (
     read_card,
 )
 from surgicai_vision.detection.detector import tensor_of, write_detector
-from surgicai_vision.detection.examples import WHOLE, Examples, render_examples
+from surgicai_vision.detection.examples import Examples, are_shown, distances, render_examples
 from surgicai_vision.detection.network import JawNetwork, loss, read_places
 from surgicai_vision.training.folder import read_state, write_state
 from surgicai_vision.training.threads import one_thread
@@ -67,9 +67,7 @@ def train_detector(
         InputError: fewer than two demonstrations, or a folder given twice.
         OutputExists: `out` holds something else.
     """
-    if len({folder.resolve() for folder in demos}) < len(demos):
-        raise InputError("A folder of demonstrations is given twice; give each folder once.")
-    paths = [path for folder in demos for path in list_demos(folder)]
+    paths = [path for folder in distinct_folders(demos) for path in list_demos(folder)]
     if len(paths) < 2:
         raise InputError(
             f"There is {len(paths)} demonstration; a detector needs at least 2, one of them to "
@@ -169,8 +167,6 @@ class _Fit:
     def errors(self) -> list[float]:
         """Return each camera's median error on the held-out images, as a share of their height."""
         self.network.eval()
-        height, width = WHOLE
-        stretch = np.array([width / height, 1.0], np.float32)
         medians = []
         for camera in range(self._cameras):
             rows = self.held[self.examples.cameras[self.held] == camera]
@@ -180,9 +176,8 @@ class _Fit:
                     for start in range(0, len(rows), BATCH)
                 ]
             true = self.examples.places[rows]
-            inside = ((true >= 0) & (true <= 1)).all(axis=2)
-            off = np.linalg.norm((torch.cat(found).numpy() - true) * stretch, axis=2)
-            medians.append(float(np.median(off[inside])))
+            off = distances(torch.cat(found).numpy(), true)
+            medians.append(float(np.median(off[are_shown(true)])))
         return medians
 
     def state(self) -> dict[str, object]:

@@ -9,9 +9,7 @@ import numpy as np
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.scene import cameras
-
-NEAREST = 0.001
-"""Least distance of a point along the camera's axis [m], so that none lies behind the lens."""
+from surgicai_vision.scene.crops import NEAREST
 
 
 def jaws_in_image(
@@ -34,10 +32,8 @@ def jaws_in_image(
     grasp = poses.position(simulation.grasp(arm))
     x, y, z = poses.transform(poses.invert(stand), grasp)
     height, width = size
-    across, down, _ = (
-        cameras.intrinsics(model, camera, height, width)
-        @ np.array([x, y, max(z, NEAREST)])
-        / max(z, NEAREST)
-    )
+    depth = max(z, NEAREST)
+    seen = np.array([x / depth, y / depth, 1.0])
+    across, down, _ = cameras.intrinsics(model, camera, height, width) @ seen
     # K has the centre of the first pixel at 0.
     return (float(across) + 0.5) / width, (float(down) + 0.5) / height

@@ -61,6 +61,11 @@ def frame_of(observation: Observation, key: str) -> "Frame":
     return observation[key]
 
 
+def image_of(observation: Observation, view: str) -> NDArray[np.uint8]:
+    """Return a camera's colours (height, width, 3)."""
+    return frame_of(observation, view).astype(np.uint8, copy=False)
+
+
 class Agent(abc.ABC):
     """What acts in the slots of an evaluation.
 
@@ -103,6 +108,37 @@ class Agent(abc.ABC):
     def share(self, features: FeatureTable) -> None:
         """Look features up in a table that agents share; its owner empties it each step."""
         return
+
+
+class WrappedAgent(Agent):
+    """An agent behind something that changes what it sees; all else is the wrapped agent's.
+
+    Args:
+        agent: who acts.
+    """
+
+    def __init__(self, agent: Agent):
+        self.name = agent.name
+        self.cameras = agent.cameras
+        self.image_size = agent.image_size
+        self.aspect = agent.aspect
+        self.part = agent.part
+        self.depth = agent.depth
+        self.privileged = agent.privileged
+        self.action_mode = agent.action_mode
+        self._agent = agent
+
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
+        """Reset the wrapped agent."""
+        self._agent.reset(slot, robot, seed)
+
+    def restart(self, slot: int) -> None:
+        """Restart the wrapped agent."""
+        self._agent.restart(slot)
+
+    def share(self, features: FeatureTable) -> None:
+        """Let the wrapped agent share features."""
+        self._agent.share(features)
 
 
 MakeAgent = Callable[[], Agent]

@@ -19,6 +19,7 @@ from surgicai_vision.evaluation.agent import (
     Observation,
     Robot,
     frame_of,
+    image_of,
     simulated,
 )
 from surgicai_vision.training.progress_input import PROGRESS_AT
@@ -298,9 +299,8 @@ class PolicyAgent(Agent):
 
 def _image(observation: Observation, view: str) -> NDArray[np.uint8]:
     """Return what a policy sees of a view, (height, width, 3)."""
-    frame = frame_of(observation, view)
     if names.is_depth_view(view):
         from surgicai_vision.dataset.codecs import grey
 
-        return grey(frame.astype(np.float32, copy=False))
-    return frame.astype(np.uint8, copy=False)
+        return grey(frame_of(observation, view).astype(np.float32, copy=False))
+    return image_of(observation, view)

@@ -23,17 +23,18 @@ from surgicai_vision.core import names
 from surgicai_vision.core.cameras import CAMERAS
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.lazy import LazyMapping
-from surgicai_vision.detection.card import check_cameras, detector_folder, read_card
+from surgicai_vision.detection.card import check_cameras, detector_folder
 from surgicai_vision.detection.detector import Detector, load_detector
 from surgicai_vision.detection.examples import PART, WHOLE, shrunk
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
-    FeatureTable,
     MakeAgent,
     Observation,
     Robot,
+    WrappedAgent,
     frame_of,
+    image_of,
 )
 from surgicai_vision.scene.cameras import CameraPose, Crop, crop_of
 from surgicai_vision.scene.crops import whole_size
@@ -56,7 +57,7 @@ def aimed(spec: "PolicySpec", detector: str | Path) -> "PolicySpec":
         InputError: a policy with a view that is no crop, or a crop of an image that is not 4:3.
     """
     folder = detector_folder(detector)
-    card = read_card(folder)
+    card = load_detector(folder).card
     views = spec.run.views
     lacking = [view for view in views if crop_of(view) is None]
     if lacking or not views:
@@ -72,7 +73,6 @@ def aimed(spec: "PolicySpec", detector: str | Path) -> "PolicySpec":
                 f"The image of '{crop.camera}' is {crop.aspect:g} times as wide as high, and a "
                 f"detector sees {WHOLE[0]} × {WHOLE[1]}; give a policy with crops of such cameras."
             )
-    load_detector(folder)
     return dataclasses.replace(
         spec,
         run=dataclasses.replace(spec.run, detector=card.weights_sha256),
@@ -94,7 +94,7 @@ def _crop(view: str) -> Crop:
 
 
 @final
-class AimedAgent(Agent):
+class AimedAgent(WrappedAgent):
     """An agent whose crops are cut from whole images.
 
     Args:
@@ -102,31 +102,15 @@ class AimedAgent(Agent):
         detector: finds the jaws.
     """
 
-    image_size = WHOLE[0]
-    aspect = WHOLE[1] / WHOLE[0]
-    part = PART
-
     def __init__(self, agent: Agent, detector: Detector):
-        self.name = agent.name
-        self.privileged = agent.privileged
-        self.action_mode = agent.action_mode
-        self._agent = agent
+        super().__init__(agent)
         self._detector = detector
         self._crops = {view: _crop(view) for view in agent.cameras}
         self._side = agent.image_size
         self.cameras = tuple(dict.fromkeys(crop.camera for crop in self._crops.values()))
-
-    def reset(self, slot: int, robot: Robot, seed: int) -> None:
-        """Reset the wrapped agent."""
-        self._agent.reset(slot, robot, seed)
-
-    def restart(self, slot: int) -> None:
-        """Restart the wrapped agent."""
-        self._agent.restart(slot)
-
-    def share(self, features: FeatureTable) -> None:
-        """Let the wrapped agent share features."""
-        self._agent.share(features)
+        self.image_size = WHOLE[0]
+        self.aspect = WHOLE[1] / WHOLE[0]
+        self.part = PART
 
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
@@ -154,7 +138,7 @@ class AimedAgent(Agent):
 
     def _find(self, observation: Observation, camera: str) -> NDArray[np.float32]:
         """Return where a camera shows both arms' jaws, (2, 2), shares of width and height."""
-        places, _ = self._detector.find(shrunk(_whole(observation, camera))[None], camera)
+        places, _ = self._detector.find(shrunk(image_of(observation, camera))[None], camera)
         found: NDArray[np.float32] = places[0]
         return found
 
@@ -163,7 +147,7 @@ class AimedAgent(Agent):
     ) -> "Image":
         """Return the crop about its arm's jaws."""
         place = found[crop.camera][names.ARMS.index(crop.arm)]
-        return cut(_whole(observation, crop.camera), crop, place, self._side)
+        return cut(image_of(observation, crop.camera), crop, place, self._side)
 
 
 def cut(image: "Image", crop: Crop, place: NDArray[np.float32], side: int) -> "Image":
@@ -192,8 +176,3 @@ def cut(image: "Image", crop: Crop, place: NDArray[np.float32], side: int) -> "I
         image, affine, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     )
     return np.asarray(part, np.uint8)
-
-
-def _whole(observation: Observation, camera: str) -> "Image":
-    """Return a camera's whole image."""
-    return frame_of(observation, camera).astype(np.uint8, copy=False)

@@ -7,10 +7,10 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
-from surgicai_vision.core.corruption import CORRUPTIONS, Moment
+from surgicai_vision.core.corruption import CORRUPTIONS, Moment, spoilt
 from surgicai_vision.detection.card import RELEASED, detector_folder
 from surgicai_vision.detection.detector import load_detector
-from surgicai_vision.detection.examples import PART, WHOLE, shrunk
+from surgicai_vision.detection.examples import PART, WHOLE, distances, shrunk
 from surgicai_vision.envs.projection import jaws_in_image
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
 
@@ -28,12 +28,11 @@ def found(config, camera, arm, strength):
     for seed in STARTS:
         env.reset(seed=seed)
         image = env.image(camera, WHOLE).astype(np.uint8)
-        for change in CORRUPTIONS.values():
-            image = change(image, strength, Moment(seed, 0, camera_number(camera), PART))
+        strengths = dict.fromkeys(CORRUPTIONS, strength)
+        image = spoilt(image, strengths, Moment(seed, 0, camera_number(camera), PART))
         places, _ = detector.find(shrunk(image)[None], camera)
         true = np.array(jaws_in_image(env.simulation, camera, arm, WHOLE))
-        off = (places[0, names.ARMS.index(arm)] - true) * (WHOLE[1] / WHOLE[0], 1.0)
-        errors.append(np.linalg.norm(off))
+        errors.append(distances(places[0, names.ARMS.index(arm)], true))
     return errors
 
 

@@ -7,23 +7,22 @@ import functools
 from collections.abc import Sequence
 from typing import final
 
-import numpy as np
-
 from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.core.corruption import Change, Image, Moment
 from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
-    FeatureTable,
     Observation,
     Robot,
+    WrappedAgent,
     frame_of,
+    image_of,
 )
 
 
 @final
-class CorruptedAgent(Agent):
+class CorruptedAgent(WrappedAgent):
     """An agent that sees through a corruption.
 
     Args:
@@ -33,15 +32,7 @@ class CorruptedAgent(Agent):
     """
 
     def __init__(self, agent: Agent, change: Change, strength: float):
-        self.name = agent.name
-        self.cameras = agent.cameras
-        self.image_size = agent.image_size
-        self.aspect = agent.aspect
-        self.part = agent.part
-        self.depth = agent.depth
-        self.privileged = agent.privileged
-        self.action_mode = agent.action_mode
-        self._agent = agent
+        super().__init__(agent)
         self._change = change
         self._strength = strength
         self._seeds: dict[int, int] = {}
@@ -51,15 +42,7 @@ class CorruptedAgent(Agent):
         """Count the slot's steps from 0."""
         self._seeds[slot] = seed
         self._steps[slot] = 0
-        self._agent.reset(slot, robot, seed)
-
-    def restart(self, slot: int) -> None:
-        """Restart the wrapped agent; the slot's step count goes on."""
-        self._agent.restart(slot)
-
-    def share(self, features: FeatureTable) -> None:
-        """Let the wrapped agent share features."""
-        self._agent.share(features)
+        super().reset(slot, robot, seed)
 
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
@@ -83,8 +66,7 @@ class CorruptedAgent(Agent):
         }
 
         def changed(view: str) -> Image:
-            image = frame_of(observation, view).astype(np.uint8, copy=False)
-            return self._change(image, self._strength, moments[view])
+            return self._change(image_of(observation, view), self._strength, moments[view])
 
         makers = {
             key: functools.partial(changed, key)
