@@ -49,6 +49,7 @@ PACKAGES = {
     "surgicai_vision.features": "features: encoders by name, the cache, the probe",
     "encoders": "features: the frozen encoders themselves",
     "surgicai_vision.training": "policy: training and checkpoints",
+    "surgicai_vision.detection": "detection: the jaws in whole images, by which crops are aimed",
     "policies": "policy: the policies themselves",
     "surgicai_vision.evaluation": "evaluation: rollouts, measures, statistics, robustness",
     "surgicai_vision.rl": "reinforcement and offline learning, with the libraries of the extra rl",
