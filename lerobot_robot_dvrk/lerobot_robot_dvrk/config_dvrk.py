@@ -13,6 +13,7 @@ from surgicai_vision.demos.imports.rosbag.config import Frames
 from surgicai_vision.robot.arm import FINGER_SHARE
 from surgicai_vision.robot.driver import DriveConfig
 from surgicai_vision.robot.guards import GuardConfig
+from surgicai_vision.robot.topics import check_topic
 
 CLOCKS = ("real", "stepped")
 
@@ -87,6 +88,8 @@ class DvrkConfig(RobotConfig):  # type: ignore[misc]  # mypy skips LeRobot
             raise InputError(
                 "a real robot needs a dead-man's switch: dead_man must be a Joy topic, /NAME."
             )
+        if self.dead_man:
+            check_topic(self.dead_man, "dead_man")
         self.drive_config()
 
     def drive_config(self) -> DriveConfig:

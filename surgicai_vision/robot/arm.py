@@ -9,9 +9,9 @@ overflow produce a warning without mutating backend state." A state command, whi
 takes the place of the oldest waiting motion when the queue is full.
 
 Beyond the contract, since a wrong set point moves a robot: a motion command is refused if its stamp
-is older than `MAX_AGE_S`, or older than that of a command already accepted. If two clients move one
-arm within `CONTROL_S` of each other, it pauses until `resume`. A message without a stamp is as old
-as its arrival.
+is older than `MAX_AGE_S`, or older than that of a command already accepted since the last reset
+(`forget`). If two clients move one arm within `CONTROL_S` of each other, it pauses until `resume`.
+A message without a stamp is as old as its arrival.
 
 An arm that may not move stays where it was measured; its jaw keeps its set point, so that what it
 holds is not dropped.
@@ -208,8 +208,9 @@ class Psm:
         self._forget_motions()
 
     def forget(self) -> None:
-        """Forget all motions that are under way or waiting; the operating state stays."""
+        """Forget all motions and the stamps of earlier ones; the operating state stays."""
         self._forget_motions()
+        self._last_stamp.clear()
 
     def advance(self, time: float, state: ArmState) -> Target | None:
         """Obey queued commands and return the arm's new set point, None for no change.

@@ -223,8 +223,15 @@ class Driver:
         )
 
     def _check_judge(self) -> None:
-        """Refuse a served simulation that advances to the next subtask in a different way."""
-        served = self._client.judgement().get("advance")
+        """Refuse a served simulation of another task, or one that advances in a different way."""
+        judged = self._client.judgement()
+        task = judged.get("task", self._task.task)
+        if task != self._task.task:
+            raise InputError(
+                f"the simulation is served with --task {task}; this policy needs "
+                f"--task {self._task.task}."
+            )
+        served = judged.get("advance")
         if self._task.task == names.SUTURE and served != self._task.advance:
             raise InputError(
                 f"the simulation is served with --advance {served}; this policy needs "

@@ -348,6 +348,8 @@ class Server:
     def _reset(self, seed: int) -> None:
         """Begin another episode: arms forget earlier commands and keep their operating states.
 
+        The stamps of earlier commands are forgotten too: another client may have another clock.
+
         Those that were stopped because the physics diverged are enabled again.
         """
         self.robot.reset(seed)
@@ -355,6 +357,7 @@ class Server:
             self._recorder.begin()
         for psm in self._psms.values():
             psm.forget()
+        self._stamps.clear()
         for name in self._diverged:
             self._psms[name].operating.state = ENABLED
         self._diverged.clear()
@@ -437,6 +440,7 @@ class Server:
         info = self.robot.info
         env = self.robot.env
         judged = {
+            "task": env.config.task,
             "seed": self.robot.seed,
             "steps": self.robot.steps,
             "subtask": env.subtask.name,

@@ -6,10 +6,12 @@ ROS's own (`<view>/image_raw`, `…/compressed`, `<view>/camera_info`). Only the
 topics under `/simulation` and the needle's pose; no robot has them.
 """
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from surgicai_vision.core.errors import InputError, shown
 from surgicai_vision.robot import messages as m
 
 STATE = "state"
@@ -26,6 +28,27 @@ DEPTHS = MappingProxyType({STATE: 10, EVENT: 10, LATCHED: 1, SERVO: 1, IMAGE: 2}
 """Quality → how many messages are kept."""
 STAYING = (EVENT, LATCHED)
 """Qualities whose messages are also for late subscribers."""
+
+
+NAME = re.compile(r"(/[A-Za-z0-9_]+)+", re.ASCII)
+"""A topic's full name, in ROS 1 and 2 (design.ros2.org, "Topic and Service name mapping")."""
+
+
+def check_topic(name: str, what: str) -> None:
+    """Refuse what is not the full name of a topic.
+
+    Args:
+        name: the name as given.
+        what: what it names, the beginning of the message.
+
+    Raises:
+        InputError: it does not begin with /, or holds what ROS does not allow.
+    """
+    if not NAME.fullmatch(name):
+        raise InputError(
+            f"{what} is {shown(name)}; a topic begins with '/': /NAME or /NAME/NAME…, of letters, "
+            "digits and _."
+        )
 
 
 @dataclass(frozen=True)
@@ -101,7 +124,7 @@ STEPPED = Topic("/simulation/stepped", m.StringStamped, EVENT)
 """Answers `RESET`, `ENTER` and `STEP`: the text is the stamp of the request, its own stamp is that
 of the states published with it."""
 JUDGEMENT = Topic("/simulation/judgement", m.StringStamped)
-"""Ground truth: the judged episode as JSON: seed, steps, subtask, who advances it, progress,
+"""Ground truth: the judged episode as JSON: task, seed, steps, subtask, who advances it, progress,
 success, errors."""
 
 

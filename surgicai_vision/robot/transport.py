@@ -20,7 +20,7 @@ from typing import Protocol, Self, final
 
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.robot.messages import Message
-from surgicai_vision.robot.topics import Topic, known_topics
+from surgicai_vision.robot.topics import Topic, check_topic, known_topics
 
 LOOPBACK = "lo"
 """The loopback's name on Linux."""
@@ -84,8 +84,7 @@ class RenamedTransport:
         known = known_topics(views)
         for name, own in renamed.items():
             check_name("topic", name, known)
-            if not own.startswith("/") or not own.strip("/"):
-                raise InputError(f"topics: {name} is called '{own}'; a topic begins with '/'.")
+            check_topic(own, f"topics: {name}")
         names = [renamed.get(name, name) for name in known]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:

@@ -404,6 +404,8 @@ def test_a_robot_needs_its_workspace_and_a_person_that_holds_it():
         DvrkConfig(dead_man="/pedal", guards={"frame": "base"} and _guards("base"), clock="stepped")
     with pytest.raises(InputError, match="give the subtask"):
         DvrkConfig(task="suture", dead_man="/pedal", guards=_guards("base"))
+    with pytest.raises(InputError, match="dead_man is '/a b'; a topic begins with '/'"):
+        DvrkConfig(dead_man="/a b", guards=_guards("base"))
 
 
 def _guards(frame):

@@ -10,11 +10,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from memory_transport import MemoryTransport
 from stepped_server import SEED, Served, env_of
 from told_clock import Clock
 
 from surgicai_vision import envs
+from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError
@@ -211,6 +213,10 @@ def test_a_robot_with_names_of_its_own_is_driven_the_same():
     [
         ({"/PSM3/servo_cp": "/x"}, "Unknown topic"),
         ({"/PSM1/servo_cp": "x"}, "begins with '/'"),
+        ({"/PSM1/servo_cp": "/a b"}, "of letters, digits and _"),
+        ({"/PSM1/servo_cp": "/a\0b"}, "of letters, digits and _"),
+        ({"/PSM1/servo_cp": "/näht"}, "of letters, digits and _"),
+        ({"/PSM1/servo_cp": "/PSM1//servo_cp"}, "of letters, digits and _"),
         ({"/PSM1/servo_cp": "/PSM2/servo_cp"}, "two are called /PSM2/servo_cp"),
     ],
 )
@@ -307,6 +313,56 @@ def test_the_log_of_a_drive_becomes_demonstrations(tmp_path):
     log.write_text(text.replace("both_arms", "arms"))
     with pytest.raises(BadFile, match="line 2"):
         import_drive_log(log, task=None, out=tmp_path / "other")
+
+
+def driven_by_command(monkeypatch, out, *options, policy="random"):
+    """Run `robot drive` at a simulation served in this process; return the exit code."""
+    monkeypatch.setattr(
+        "surgicai_vision.robot.transport.open_transport", lambda *_: Served("grasp")
+    )
+    command = ["robot", "drive", policy, "--task", "grasp", "--simulated", "--clock", "stepped"]
+    return main([*command, "--send", "--seconds", "0.06", "--out", str(out), *options])
+
+
+def test_a_log_that_was_cut_off_is_continued_with_whole_lines(monkeypatch, tmp_path):
+    assert driven_by_command(monkeypatch, tmp_path) == 0
+    log = tmp_path / "drive.jsonl"
+    whole = log.read_bytes()
+    log.write_bytes(whole + b'{"time": 17')
+    assert driven_by_command(monkeypatch, tmp_path) == 0
+    assert log.read_bytes().startswith(whole)
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [number for number, line in enumerate(lines) if "policy" in line] == [0, 4]
+    assert len(lines) == 8
+
+
+@pytest.mark.parametrize(
+    ("options", "given", "problem"),
+    [
+        ((), {"jaw_scale": math.nan}, "jaw_scale is nan"),
+        ((), {"guards": {"max_speed": 9.0}}, "max_speed is 9"),
+        (("--dead-man", "pedal"), {}, "--dead-man is 'pedal'"),
+        (("--dead-man", "/a b"), {}, "--dead-man is '/a b'"),
+    ],
+)
+def test_wrong_input_is_refused_before_a_robot_is_looked_for(
+    monkeypatch, tmp_path, capsys, options, given, problem
+):
+    def connect(self):
+        raise AssertionError("it looks for a robot")
+
+    monkeypatch.setattr(Client, "connect", connect)
+    config = tmp_path / "robot.yaml"
+    config.write_text(yaml.safe_dump(given))
+    options = (*options, "--config", str(config))
+    assert driven_by_command(monkeypatch, tmp_path / "log", *options) == 2
+    assert problem in capsys.readouterr().err
+    assert not (tmp_path / "log").exists()
+
+
+def test_a_simulation_of_another_task_is_refused():
+    with pytest.raises(InputError, match="served with --task grasp; this policy needs --task ins"):
+        drive(RandomAgent(), "insert", 3, transport=Served("grasp"))
 
 
 def test_images_reach_the_agent_as_they_were_rendered():

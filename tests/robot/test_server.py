@@ -278,6 +278,27 @@ def test_what_was_sent_before_a_reset_is_not_obeyed_after_it():
     assert client.robot.state("PSM2").jaw_setpoint < 0.8
 
 
+def test_a_reset_forgets_the_stamps_of_the_last_client():
+    """Stepped: another client's clock may be behind that of the one before it."""
+    client = Client()
+    late = 10**12
+
+    def jaw(stamp, angle):
+        return JointState(Header(stamp), ("jaw",), (angle,))
+
+    client.stamp = late - 1
+    client.step(**{"/PSM2/jaw/servo_jp": jaw(late, 0.5)})
+    client.say("/simulation/reset", StringStamped(Header(7), str(SEED)))
+    client.server.poll()
+    client.say(topics.STEP.name, StringStamped(Header(8), "/PSM2/jaw/servo_jp"))
+    client.server.poll()
+    assert client.robot.steps == 0, "it waits for the command of this stamp"
+    client.say("/PSM2/jaw/servo_jp", jaw(8, 0.3))
+    client.server.poll()
+    assert client.robot.steps == 1
+    assert client.robot.state("PSM2").jaw_setpoint == pytest.approx(0.3)
+
+
 def test_a_stop_sent_before_a_reset_is_obeyed_after_it():
     client = Client()
     client.say("/PSM2/state_command", StringStamped(Header(), "fault"))

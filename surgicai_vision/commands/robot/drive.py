@@ -1,6 +1,7 @@
 """`robot drive`: a policy drives a dVRK, simulated or real, over CRTK."""
 
 import json
+import os
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -58,6 +59,8 @@ Without --send nothing is sent: the command prints what it would send. docs/robo
 guards.""",
 )
 LOG = "drive.jsonl"
+LONGEST_LINE = 1 << 20
+"""More bytes than a line of the log has."""
 KEY = "key"
 NONE = "none"
 
@@ -120,13 +123,6 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     from surgicai_vision.robot.driver import DriveConfig, check_drivable
     from surgicai_vision.robot.guards import GuardConfig
 
-    spec = open_given(
-        options.policy,
-        options.task,
-        options.env,
-        None,
-        WeightsSource.parse(options.weights, options.accept_licence),
-    )
     config = DriveConfig(
         from_mapping(GuardConfig, options.guards or {}, "guards"),
         options.send,
@@ -134,12 +130,20 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         options.clock == "stepped",
     )
     frames = from_mapping(Frames, options.frames or {}, "frames")
+    switch = _switch(options)
+    spec = open_given(
+        options.policy,
+        options.task,
+        options.env,
+        None,
+        WeightsSource.parse(options.weights, options.accept_licence),
+    )
     out = options.out or folders.OUTPUTS / "drive" / f"{spec.config.task}-{spec.name}"
     folders.check_folder(out, LOG)
     agent = spec.make_agent()
     check_drivable(agent, spec.config)
     with ExitStack() as stack:
-        driver = _driver(options, spec, agent, config, frames, out, stack, console)
+        driver = _driver(options, spec, agent, config, frames, switch, out, stack, console)
         episodes = _drive(driver, options, spec.config, console)
     return _told(options, spec, episodes, out / LOG, console)
 
@@ -150,6 +154,7 @@ def _driver(
     agent: "Agent",
     config: "DriveConfig",
     frames: "Frames",
+    switch: str,
     out: Path,
     stack: ExitStack,
     console: Console,
@@ -162,6 +167,7 @@ def _driver(
         agent: its agent.
         config: how it drives.
         frames: the robot's frames, where they differ from ours.
+        switch: the dead-man's switch, as `_switch` returns it.
         out: the log's folder.
         stack: closes what is opened.
         console: prints what a dry run would send.
@@ -178,7 +184,7 @@ def _driver(
     transport = stack.enter_context(
         open_transport(options.transport, options.interface, ros_domain(options.domain))
     )
-    dead_man = _dead_man(options, transport, stack)
+    dead_man = _dead_man(switch, transport, stack)
     client = Client(
         RenamedTransport(transport, renamed_topics(options.topics), views),
         ClientConfig(
@@ -187,8 +193,10 @@ def _driver(
             is_simulated=options.simulated,
         ),
     )
+    robot = DrivenRobot(client, views, spec.config.task, agent.image_size, frames, jaw_scale)
     client.connect()
     out.mkdir(parents=True, exist_ok=True)
+    _cut_torn_line(out / LOG)
     log = stack.enter_context((out / LOG).open("a", buffering=1, encoding="utf-8"))
     about = {
         "policy": options.policy,
@@ -198,7 +206,6 @@ def _driver(
         "code_version": code_version(),
     }
     log.write(json.dumps(about) + "\n")
-    robot = DrivenRobot(client, views, spec.config.task, agent.image_size, frames, jaw_scale)
     return Driver(agent, robot, spec.config, config, dead_man, log, console.note)
 
 
@@ -273,26 +280,56 @@ def _told(
     }
 
 
-def _dead_man(options: Options, transport: "Transport", stack: ExitStack) -> "Callable[[], float]":
-    """Return a function that says for how long the dead-man's switch was not held [s].
+def _switch(options: Options) -> str:
+    """Return the dead-man's switch: `KEY`, `NONE` or a topic.
 
     Raises:
         InputError: "none" for a real robot, or something that is not a switch.
     """
-    from surgicai_vision.robot.dead_man import HeldKey, HeldPedal
+    from surgicai_vision.robot.topics import check_topic
 
     given = options.dead_man or (NONE if options.simulated else KEY)
-    if given == NONE:
-        if not options.simulated:
-            raise InputError(
-                "--dead-man none is for a served simulation; at a robot, a person holds the switch."
-            )
-        return lambda: 0.0
-    if given == KEY:
-        return stack.enter_context(HeldKey()).age
+    if given == NONE and not options.simulated:
+        raise InputError(
+            "--dead-man none is for a served simulation; at a robot, a person holds the switch."
+        )
+    if given in (KEY, NONE):
+        return given
     if not given.startswith("/"):
         raise InputError(f"--dead-man is '{given}'; allowed: {KEY}, {NONE} or a topic, /NAME.")
-    return HeldPedal(transport, given).age
+    check_topic(given, "--dead-man")
+    return given
+
+
+def _dead_man(switch: str, transport: "Transport", stack: ExitStack) -> "Callable[[], float]":
+    """Return a function that says for how long the dead-man's switch was not held [s].
+
+    Raises:
+        InputError: the space bar is the switch, and standard input is no terminal.
+    """
+    from surgicai_vision.robot.dead_man import HeldKey, HeldPedal
+
+    if switch == NONE:
+        return lambda: 0.0
+    if switch == KEY:
+        return stack.enter_context(HeldKey()).age
+    return HeldPedal(transport, switch).age
+
+
+def _cut_torn_line(log: Path) -> None:
+    """Cut the incomplete last line that a kill or a full disk leaves; the next one would join it.
+
+    Args:
+        log: the log; it need not exist.
+    """
+    if not log.exists():
+        return
+    with log.open("rb+") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - LONGEST_LINE))
+        tail = file.read()
+        if tail and not tail.endswith(b"\n"):
+            file.truncate(size - len(tail) + tail.rfind(b"\n") + 1)
 
 
 def _about(seed: int, options: Options) -> str:
