@@ -32,10 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.cameras import camera_names
+from surgicai_vision.core.cameras import camera_names, check_camera
 from surgicai_vision.core.config import TaskConfig, digest, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset import open_h
 from surgicai_vision.evaluation.agent import (
     Actions,
@@ -184,8 +185,8 @@ def _circumstances(
     """
     path = folder / TRAINING
     env = _part(path, training, "env")
-    root = _part(path, training, "dataset").get("root")
-    features: Mapping[str, Any] = {}
+    root = checked(_part(path, training, "dataset").get("root") or "", str, f"{path}: root")
+    features: Inputs | None = None
     if env.get("type") == ENV_TYPE:
         fields = {
             field.name: env[field.name]
@@ -195,12 +196,8 @@ def _circumstances(
         config = from_mapping(TaskConfig, fields, str(path))
         if env.get("encoder"):
             _check_keys(path, env, "cameras", "image_size")
-            features = {
-                "encoder": env["encoder"],
-                "views": env["cameras"],
-                "weights_sha256": env.get("encoder_sha256", ""),
-                "size": env["image_size"],
-            }
+            sha256 = env.get("encoder_sha256", "")
+            features = _features(path, env["encoder"], env["cameras"], sha256, env["image_size"])
     elif root and (Path(root) / names.META_FILE).is_file():
         path = Path(root) / names.META_FILE
         meta = _table(path)
@@ -210,7 +207,13 @@ def _circumstances(
         if exported:
             _check_keys(path, meta, "image_size")
             _check_keys(path, exported, "encoder", "views", "weights_sha256")
-            features = {**exported, "size": meta["image_size"]}
+            features = _features(
+                path,
+                exported["encoder"],
+                exported["views"],
+                exported["weights_sha256"],
+                meta["image_size"],
+            )
     elif task:
         config = TaskConfig(task=task)
     else:
@@ -253,20 +256,31 @@ def _action_mode(folder: Path, seen: Mapping[str, Any], said: Mapping[str, Any])
     return sizes[known.pop()] if known else names.INCREMENTS
 
 
-def _inputs(folder: Path, seen: Mapping[str, Any], features: Mapping[str, Any]) -> Inputs:
+def _features(path: Path, encoder: object, views: object, sha256: object, size: object) -> Inputs:
+    """Return what a policy sees that sees features, as the file `path` says it.
+
+    Raises:
+        BadFile: a value is of another type.
+        UnknownName: no such camera.
+    """
+    cameras = checked(views, list, f"{path}: cameras")
+    return Inputs(
+        tuple(check_camera(checked(camera, str, f"{path}: a camera")) for camera in cameras),
+        checked(size, int, f"{path}: image_size"),
+        checked(encoder, str, f"{path}: encoder"),
+        checked(sha256, str, f"{path}: the hash of the encoder's weights"),
+    )
+
+
+def _inputs(folder: Path, seen: Mapping[str, Any], features: Inputs | None) -> Inputs:
     """Return what a policy with these inputs sees."""
     if names.ENVIRONMENT_STATE in seen:
-        if not features:
+        if features is None:
             raise InputError(
                 f"{folder} sees {names.ENVIRONMENT_STATE}, and neither its env nor its dataset "
                 "names its encoder; train it on an exported dataset of ours."
             )
-        return Inputs(
-            tuple(features["views"]),
-            features["size"],
-            features["encoder"],
-            features["weights_sha256"],
-        )
+        return features
     shapes = {key: value["shape"] for key, value in seen.items() if value["type"] == VISUAL}
     known = {names.image_key(view): view for view in camera_names()}
     known |= {open_h.image_key(view): view for view in open_h.IMAGES}
