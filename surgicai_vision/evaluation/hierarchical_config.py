@@ -11,12 +11,11 @@ Interface:
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from surgicai_vision.core import names
 from surgicai_vision.core.config import DWELL, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.core.files import read_yaml
+from surgicai_vision.core.yaml_text import dump_yaml
 from surgicai_vision.training.run_config import TERMINATIONS
 
 ORDER = "order"
@@ -121,4 +120,4 @@ def read_hierarchical(path: Path) -> HierarchicalConfig:
 
 def hierarchical_yaml(config: HierarchicalConfig) -> bytes:
     """Return the YAML file of a hierarchical policy, its keys in the order of the fields."""
-    return yaml.safe_dump(to_mapping(config), sort_keys=False).encode()
+    return dump_yaml(to_mapping(config)).encode()

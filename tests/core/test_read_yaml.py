@@ -13,7 +13,7 @@ from surgicai_vision.commands.sweep import read_experiment
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, read_changes
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_yaml
-from surgicai_vision.core.yaml_text import load_yaml
+from surgicai_vision.core.yaml_text import dump_yaml, load_yaml
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.experiments.plan_config import read_plan
 from surgicai_vision.training.policies import load_recipe
@@ -173,9 +173,29 @@ def test_a_change_that_no_value_stands_for_is_refused():
         ("e4", "e4"),
         ("'3e-4'", "3e-4"),
         ("12", 12),
+        ("010", 10),
+        ("-08", -8),
+        ("0", 0),
+        ("0o17", 15),
+        ("0x1F", 31),
+        ("10_000", 10_000),
+        ("1_0.5", 10.5),
+        ("1.", 1.0),
+        ("007.5", 7.5),
+        ("-.inf", float("-inf")),
+        ("1:30", "1:30"),
+        ("1:30.5", "1:30.5"),
+        ("1_", "1_"),
+        ("1.2.3", "1.2.3"),
     ],
 )
-def test_numbers_with_an_exponent_need_no_dot(tmp_path, text, value):
+def test_numbers_are_those_of_yaml_1_2(tmp_path, text, value):
     (tmp_path / "given.yaml").write_text(f"a: {text}\n")
     for found in (read_yaml(tmp_path / "given.yaml")["a"], read_changes((f"a={text}",))["a"]):
         assert found == value and type(found) is type(value)
+
+
+@pytest.mark.parametrize("text", ["08", "1e5", "3e-4", "0o17", "1:30", "1_000", ".5", "yes", "a"])
+def test_a_text_that_is_written_is_read_as_that_text(text):
+    table = {"text": text, "numbers": [8, 10, 0.0003, 1e22, True, None]}
+    assert load_yaml(dump_yaml(table)) == table
