@@ -11,6 +11,7 @@ import numpy as np
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.errors import SurgicaiError
+from surgicai_vision.core.words import plural
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.storage import read_film
 from surgicai_vision.report.episodes import film_id
@@ -22,7 +23,10 @@ SIZE = 224
 
 
 def static_images(groups: Sequence[Group], reel: Reel) -> dict[str, object]:
-    """Return views, a success, a failure and rollouts side by side, or why there are none."""
+    """Return views, a success, a failure and rollouts side by side, or why there are none.
+
+    One film that cannot be shown does not take the others with it.
+    """
     colours = ["#" + bytes(colour).hex() for colour in contact_sheet.PALETTE]
     parts = [
         {"name": name, "colour": colour} for name, colour in zip(names.PARTS, colours, strict=True)
@@ -31,48 +35,66 @@ def static_images(groups: Sequence[Group], reel: Reel) -> dict[str, object]:
         task: [_rollout(choice, reel) for choice in choices]
         for task, choices in reel.compared.items()
     }
-    page: dict[str, object] = {
+    problem = reel.problem
+    views: list[dict[str, object]] = []
+    if not problem:
+        try:
+            views = _views(groups, reel)
+        except SurgicaiError as error:
+            problem = f"No images: {error}"
+    outcomes = ((True, "success"), (False, "failure"))
+    return {
         "image_size": SIZE,
         "parts": parts,
-        "no_images": "",
+        "no_images": problem,
+        "views": views,
+        "strips": (
+            [{"title": "", "frames": [], "text": reel.problem}]
+            if reel.problem
+            else [_strip(choose(groups, reel, success=won), word) for won, word in outcomes]
+        ),
         "compared": [
             {"task": task, "start": reel.compared[task][0].row["seed"], "rollouts": rollouts}
             for task, found in shown.items()
             if len(rollouts := [rollout for rollout in found if rollout]) > 1
         ],
         "films": len(reel.strips),
-        "films_wanted": reel.wanted,
+        "films_wanted": reel.wanted - len(reel.left_out),
+        "films_left_out": _left_out(reel),
     }
-    try:
-        if reel.problem:
-            raise SurgicaiError(reel.problem.removeprefix("No images: "))
-        outcomes = ((True, "success"), (False, "failure"))
-        page["strips"] = [_strip(choose(groups, success=won), word) for won, word in outcomes]
-        page["views"] = _views(groups)
-    except SurgicaiError as error:
-        reason = f"No images: {error}"
-        page.update(
-            views=[],
-            strips=[{"title": "", "frames": [], "text": reason}],
-            no_images=reason,
-            compared=[],
-        )
-    return page
 
 
-def choose(groups: Sequence[Group], success: bool) -> Choice | None:
+def choose(groups: Sequence[Group], reel: Reel, success: bool) -> Choice | None:
     """Choose the episode for a film.
 
-    It is the best trained policy's first one, else another policy's; references come last.
+    It is the best trained policy's first one, else another policy's; references come last, and
+    after them evaluations with a film that cannot be shown.
     """
     best = best_trained(groups)
-    ordered = sorted(groups, key=lambda item: (item is not best, not item.condition.trained))
-    for item in ordered:
-        for result in item.results:
-            for row in result.rows:
-                if row["success"] == success and not row["error"]:
-                    return Choice(item, result, row)
+    damaged = {folder for folder, _ in reel.left_out}
+    ordered = sorted(
+        ((item, result) for item in groups for result in item.results),
+        key=lambda pair: (
+            str(pair[1].folder) in damaged,
+            pair[0] is not best,
+            not pair[0].condition.trained,
+        ),
+    )
+    for item, result in ordered:
+        for row in result.rows:
+            if row["success"] == success and not row["error"]:
+                return Choice(item, result, row)
     return None
+
+
+def _left_out(reel: Reel) -> str:
+    """Return how many films cannot be shown, with the first reason; empty if there are none."""
+    count = len(reel.left_out)
+    if not count:
+        return ""
+    reason = next(iter(reel.left_out.values()))
+    what = plural(count, "film") + " cannot be shown"
+    return f"{what}: {reason}" if count == 1 else f"{what}; the first: {reason}"
 
 
 def _strip(choice: Choice | None, kind: str) -> dict[str, object]:
@@ -86,22 +108,26 @@ def _strip(choice: Choice | None, kind: str) -> dict[str, object]:
     row = choice.row
     condition = choice.group.condition
     view = choice.view
-    film = read_film(choice.result.folder, row["seed"])
-    with contact_sheet.state_renderer(choice.result.config, SIZE) as image:
-        frames = [
-            {
-                "step": int(step),
-                "data": _data(contact_sheet.jpeg(image(state, *camera_and_modality(view)))),
-            }
-            for step, state in zip(film.steps, film.states, strict=True)
-        ]
+    title = f"A {kind} in {condition.task}"
+    try:
+        film = read_film(choice.result.folder, row["seed"])
+        with contact_sheet.state_renderer(choice.result.config, SIZE) as image:
+            frames = [
+                {
+                    "step": int(step),
+                    "data": _data(contact_sheet.jpeg(image(state, *camera_and_modality(view)))),
+                }
+                for step, state in zip(film.steps, film.states, strict=True)
+            ]
+    except SurgicaiError as error:
+        return {"title": title, "frames": [], "text": f"No images: {error}"}
     end = f"{row['d_trans_mm']:.1f} mm and {row['d_angle_deg']:.1f}° from the goal at the end"
     why = "" if row["success"] else f" ({row['failure']})"
     words = (
         f"{condition.policy}, start {row['seed']}, seen by {view}: {kind}{why} after {row['steps']}"
         f" steps; {end}."
     )
-    return {"title": f"A {kind} in {condition.task}", "frames": frames, "text": words}
+    return {"title": title, "frames": frames, "text": words}
 
 
 def _rollout(choice: Choice, reel: Reel) -> dict[str, object] | None:
@@ -125,11 +151,11 @@ def _rollout(choice: Choice, reel: Reel) -> dict[str, object] | None:
     }
 
 
-def _views(groups: Sequence[Group]) -> list[dict[str, object]]:
+def _views(groups: Sequence[Group], reel: Reel) -> list[dict[str, object]]:
     """Render every modality of the views that were used, at the start of an episode."""
     used = {names.camera_of(view) for item in groups for view in item.condition.views}
     shown = [view for view in camera_names() if view in (used or {"front", "back"})]
-    chosen = choose(groups, success=True) or choose(groups, success=False)
+    chosen = choose(groups, reel, success=True) or choose(groups, reel, success=False)
     if chosen is None:
         return []
     film = read_film(chosen.result.folder, chosen.row["seed"])

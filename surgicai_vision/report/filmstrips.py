@@ -20,6 +20,7 @@ from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.storage import read_film
 from surgicai_vision.report.groups import Group, of_task
 from surgicai_vision.report.reader import Result
+from surgicai_vision.scene import opengl
 
 FRAMES = 8
 SIZE = 128
@@ -84,12 +85,15 @@ class Reel:
         strips: an episode's identity → its strip.
         compared: task → the rollouts from one start.
         wanted: how many episodes are worth a strip.
+        left_out: an episode's identity → why it cannot be shown: a damaged film, a state that is
+            none of its scene.
         problem: why there are no images, or "".
     """
 
     strips: dict[tuple[str, int], Strip] = field(default_factory=dict)
     compared: dict[str, list[Choice]] = field(default_factory=dict)
     wanted: int = 0
+    left_out: dict[tuple[str, int], str] = field(default_factory=dict)
     problem: str = ""
 
 
@@ -111,7 +115,7 @@ def make_reel(
     chosen = list(wanted.values())[:most]
     left = BUDGET
     try:
-        for done, strip in enumerate(_render(chosen), 1):
+        for done, strip in enumerate(_render(chosen, reel.left_out), 1):
             size = sum(map(len, strip.frames))
             if size > left:
                 continue
@@ -178,15 +182,28 @@ def _first(item: Group, wish: Callable[[dict[str, Any]], bool]) -> Iterator[Choi
                 return
 
 
-def _render(choices: Sequence[Choice]) -> Iterator[Strip]:
-    """Render strips; those of one scene together, since making a scene costs more than a strip."""
+def _render(choices: Sequence[Choice], left_out: dict[tuple[str, int], str]) -> Iterator[Strip]:
+    """Render strips; those of one scene together, since making a scene costs more than a strip.
+
+    Args:
+        choices: the episodes.
+        left_out: where it is noted why an episode cannot be shown (`Reel.left_out`).
+
+    Raises:
+        SurgicaiError: a scene cannot be made, or nothing can be drawn on this machine.
+    """
     scenes: dict[str, list[Choice]] = {}
     for choice in choices:
         scenes.setdefault(repr(sorted(to_mapping(choice.result.config).items())), []).append(choice)
     for members in scenes.values():
+        opengl.make_current()  # what is raised below is then about one episode, not the machine
         with contact_sheet.state_renderer(members[0].result.config, SIZE, "fast") as image:
             for choice in members:
-                strip = _strip(choice, image)
+                try:
+                    strip = _strip(choice, image)
+                except SurgicaiError as error:
+                    left_out[choice.identity] = str(error)
+                    continue
                 if strip is not None:
                     yield strip
 

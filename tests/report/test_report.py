@@ -18,6 +18,7 @@ from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.metrics import EpisodeMetrics
 from surgicai_vision.evaluation.slot import Episode, Film
 from surgicai_vision.evaluation.storage import (
+    FILMS,
     FORMAT,
     MARKER,
     find_evaluations,
@@ -231,6 +232,40 @@ def test_without_gl_the_numbers_remain(results, monkeypatch):
     text = report.write_report(results).read_text()
     assert "No images: nothing renders" in text
     assert "13/20" in text
+
+
+def test_a_film_that_cannot_be_shown_takes_no_other_with_it(results, painted):
+    damaged = results / "evaluations/imagenet-lite-front" / FILMS  # the best policy's
+    damaged.write_bytes(b"no safetensors")
+    text = report.write_report(results).read_text()
+    assert f"3 films cannot be shown; the first: {damaged} is damaged" in text
+    assert "imagenet-lite, start 900000, seen by back: success" in text
+    assert "imagenet-lite, start 900009, seen by back: failure" in text
+    assert 'alt="front view, RGB"' in text and "No images" not in text
+    assert not (results / "tables/failures.jpg").exists(), "films of the best policy are lost"
+    for folder in find_evaluations(results):
+        (folder / FILMS).write_bytes(b"no safetensors")
+    text = report.write_report(results).read_text()
+    assert "No images" in text and "13/20" in text and 'src="data:image' not in text
+    assert "No episode of any policy" not in text
+
+
+def test_a_state_that_is_none_of_its_scene_takes_no_other_film_with_it(results, monkeypatch):
+    @contextlib.contextmanager
+    def stage(config, size, quality="high"):
+        def image(state, view, modality="rgb"):
+            if state[1] == names.TEST_SEED:
+                raise SurgicaiError("a state of another scene")
+            return draw(state, view, modality)
+
+        with painted_stage(config, size, quality) as draw:
+            yield image
+
+    monkeypatch.setattr(contact_sheet, "state_renderer", stage)
+    text = report.write_report(results).read_text()
+    assert "films cannot be shown; the first: a state of another scene" in text
+    details = json.loads(text.split('id="details">')[1].split("</script>")[0])
+    assert any(entry["films"] for entry in details) and (results / "tables/failures.jpg").exists()
 
 
 def test_names_from_outside_are_escaped(tmp_path, painted):
