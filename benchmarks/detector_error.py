@@ -104,7 +104,7 @@ def write_sheet(options: argparse.Namespace) -> None:
             row += [
                 cv2.resize(marked, (SIDE * width // height, SIDE), interpolation=cv2.INTER_AREA),
                 corrupted(reported, axis, 0.5, Moment(seed, 0, number)),
-                cut(image, crop, place, SIDE),
+                cut(image, crop, place, (SIDE, SIDE)),
             ]
         framed = [np.pad(each, ((2, 2), (2, 2), (0, 0)), constant_values=255) for each in row]
         rows.append(np.concatenate(framed, axis=1))

@@ -8,8 +8,8 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import COUNT, DIRECTORY, EXECUTOR, LIST, SEED
-from surgicai_vision.core.cameras import check_camera
+from surgicai_vision.commands.options import COUNT, DIRECTORY, EXECUTOR, SEED, UNIQUE
+from surgicai_vision.core.cameras import camera_names, check_camera
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.words import plural
 from surgicai_vision.detection.card import CAMERAS, CARD, EPOCHS, PER_DEMO
@@ -40,7 +40,7 @@ class Options:
     """
 
     demos: Annotated[tuple[Path, ...], Parameter(metavar="DIR[,DIR]")]
-    camera: Annotated[tuple[str, ...], LIST, Parameter(metavar="CAMERA[,CAMERA]")] = CAMERAS
+    camera: Annotated[tuple[str, ...], UNIQUE, Parameter(metavar="CAMERA[,CAMERA]")] = CAMERAS
     per_demo: Annotated[int, COUNT] = PER_DEMO
     epochs: Annotated[int, COUNT] = EPOCHS
     seed: Annotated[int, SEED] = 0
@@ -53,10 +53,13 @@ class Options:
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Render examples, train the detector and print how far off it is."""
     from surgicai_vision.core.executor import LOCAL, RunContext, open_engine
+    from surgicai_vision.detection.examples import can_be_aimed
     from surgicai_vision.scene.cameras import crop_of
     from surgicai_vision.scene.opengl import check_opengl
 
     context = RunContext(options.workers, open_engine(options.executor), console.stage)
+    crops = [crop for crop in map(crop_of, camera_names()) if crop is not None]
+    aimable = dict.fromkeys(crop.camera for crop in crops if can_be_aimed(crop))
     for camera in options.camera:
         check_camera(camera)
         crop = crop_of(camera)
@@ -64,6 +67,11 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
             raise InputError(
                 f"--camera {camera} is a crop, which shows only what lies about the reported jaws; "
                 f"give its camera, {crop.camera}."
+            )
+        if camera not in aimable:
+            raise InputError(
+                f"--camera {camera}: a detector aims crops of 4:3 images, and this camera has "
+                f"none; allowed: {', '.join(aimable)}."
             )
     for folder in options.demos:
         folders.demos_task(folder)

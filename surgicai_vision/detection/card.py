@@ -1,7 +1,8 @@
 """What a detector is, and where it lies; light to import.
 
 A detector's folder holds `detector.safetensors`, the weights, and `detector.json`, its card, which
-is written last. `released:detector` is the one that comes with the product.
+is written last. `released:detector` is the one that comes with the product, or that of the folder
+of released policies which is used instead (`training.released`).
 """
 
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from pathlib import Path
 from surgicai_vision.core.config import digest, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.files import PACKAGE, read_json
-from surgicai_vision.training.released import is_released
+from surgicai_vision.training.released import is_released, released_folder
 
 CARD = "detector.json"
 WEIGHTS = "detector.safetensors"
@@ -39,6 +40,7 @@ class DetectorCard:
         code_version: version of the code that made it.
         weights_sha256: hash of its weights.
         format: version of this layout.
+        per_demo: states of each demonstration that were rendered; None in cards that do not say it.
     """
 
     cameras: tuple[str, ...]
@@ -50,10 +52,14 @@ class DetectorCard:
     code_version: str
     weights_sha256: str = ""
     format: int = FORMAT
+    per_demo: int | None = None
 
 
 def detector_folder(given: str | Path) -> Path:
     """Return the folder of a detector: that of `RELEASED`, or the given one.
+
+    `RELEASED` is `detector` in the folder of released policies that the environment names, and the
+    package's where that folder has none: `surgicai-vision release` builds policies alone.
 
     Raises:
         UnknownName: another name than `RELEASED` with its prefix.
@@ -61,7 +67,8 @@ def detector_folder(given: str | Path) -> Path:
     if not is_released(given):
         return Path(given)
     check_name("released detector", str(given), (RELEASED,))
-    return PACKAGE / "released" / "detector"
+    own = released_folder() / "detector"
+    return own if own.exists() else PACKAGE / "released" / "detector"
 
 
 def read_card(folder: Path) -> DetectorCard:

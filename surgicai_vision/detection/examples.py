@@ -10,10 +10,12 @@ half of the images have smoke, blur or noise. One job renders one demonstration,
 which was killed continues.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -26,6 +28,9 @@ from surgicai_vision.core.corruption import Image
 from surgicai_vision.core.executor import Job, RunContext, register_job, run
 from surgicai_vision.core.files import sha256_file
 from surgicai_vision.core.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from surgicai_vision.scene.cameras import Crop
 
 EXAMPLES_FILE = "examples.safetensors"
 WHOLE = (480, 640)
@@ -112,6 +117,11 @@ def render_examples(
         np.tile(np.arange(len(cameras)), len(images)),
         np.repeat(np.arange(len(shards)), np.array(counts) * len(cameras)),
     )
+
+
+def can_be_aimed(crop: "Crop") -> bool:
+    """Return whether the images of a crop's camera are as wide as those of a detector."""
+    return math.isclose(crop.aspect, WHOLE[1] / WHOLE[0])
 
 
 def shrunk(image: Image) -> NDArray[np.uint8]:

@@ -76,8 +76,9 @@ def train_detector(
     made_of = demos_digest(paths)
     if (out / CARD).is_file():
         card = read_card(out)
-        same = (tuple(cameras), made_of, epochs, seed)
-        if (card.cameras, card.demos, card.epochs, card.seed) != same:
+        states = per_demo if card.per_demo is None else card.per_demo
+        same = (tuple(cameras), made_of, epochs, seed, per_demo)
+        if (card.cameras, card.demos, card.epochs, card.seed, states) != same:
             raise OutputExists(
                 f"--out {out} holds another detector; give a folder that does not exist yet."
             )
@@ -111,6 +112,7 @@ def train_detector(
             seed,
             dict(zip(cameras, errors, strict=True)),
             code_version("detection"),
+            per_demo=per_demo,
         )
         with whole_folder(result) as folder:
             write_detector(folder, card, fit.network)

@@ -10,7 +10,6 @@ wraps is unchanged. Inputs other than images still come from the reported joints
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, final
@@ -25,7 +24,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.detection.card import check_cameras, detector_folder
 from surgicai_vision.detection.detector import Detector, load_detector
-from surgicai_vision.detection.examples import PART, WHOLE, shrunk
+from surgicai_vision.detection.examples import PART, WHOLE, can_be_aimed, shrunk
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
@@ -68,7 +67,7 @@ def aimed(spec: "PolicySpec", detector: str | Path) -> "PolicySpec":
     crops = [_crop(view) for view in views]
     check_cameras(card, tuple(dict.fromkeys(crop.camera for crop in crops)))
     for crop in crops:
-        if not math.isclose(crop.aspect, WHOLE[1] / WHOLE[0]):
+        if not can_be_aimed(crop):
             raise InputError(
                 f"The image of '{crop.camera}' is {crop.aspect:g} times as wide as high, and a "
                 f"detector sees {WHOLE[0]} × {WHOLE[1]}; give a policy with crops of such cameras."
@@ -100,13 +99,21 @@ class AimedAgent(WrappedAgent):
     Args:
         agent: who acts; it sees nothing but crops, of one size.
         detector: finds the jaws.
+
+    Raises:
+        InputError: an agent that needs depth.
     """
 
     def __init__(self, agent: Agent, detector: Detector):
+        if agent.depth:
+            raise InputError(
+                f"A detector aims crops in colour, and {agent.name} needs their depth too; leave "
+                "the detector out."
+            )
         super().__init__(agent)
         self._detector = detector
         self._crops = {view: _crop(view) for view in agent.cameras}
-        self._side = agent.image_size
+        self._size = (agent.image_size, round(agent.image_size * agent.aspect))
         self.cameras = tuple(dict.fromkeys(crop.camera for crop in self._crops.values()))
         self.image_size = WHOLE[0]
         self.aspect = WHOLE[1] / WHOLE[0]
@@ -116,9 +123,9 @@ class AimedAgent(WrappedAgent):
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the agent's actions (n, 7) on its crops."""
-        return self._agent.act(slots, robots, [self._seen(seen) for seen in observations])
+        return self._agent.act(slots, robots, [self.crops(seen) for seen in observations])
 
-    def _seen(self, observation: Observation) -> Observation:
+    def crops(self, observation: Observation) -> Observation:
         """Return an observation whose crops are cut when they are accessed."""
         assert isinstance(observation, Mapping), "the env of an agent with cameras shows images"
         found = LazyMapping(
@@ -147,10 +154,10 @@ class AimedAgent(WrappedAgent):
     ) -> "Image":
         """Return the crop about its arm's jaws."""
         place = found[crop.camera][names.ARMS.index(crop.arm)]
-        return cut(image_of(observation, crop.camera), crop, place, self._side)
+        return cut(image_of(observation, crop.camera), crop, place, self._size)
 
 
-def cut(image: "Image", crop: Crop, place: NDArray[np.float32], side: int) -> "Image":
+def cut(image: "Image", crop: Crop, place: NDArray[np.float32], size: tuple[int, int]) -> "Image":
     """Return the part of a whole image that a crop shows when it lies about a place.
 
     As in `scene.crops`, a crop near the border shows the part of the image at that border.
@@ -159,20 +166,18 @@ def cut(image: "Image", crop: Crop, place: NDArray[np.float32], side: int) -> "I
         image: whole image of the crop's camera, (height, width, 3).
         crop: whose scale is taken.
         place: x and y as shares of the image's width and height.
-        side: height and width of the result [pixel].
+        size: height and width of the result [pixel].
     """
     camera = CAMERAS.load(crop.camera)
     assert isinstance(camera, CameraPose), "a crop is cut from a camera's image"
     height, width = image.shape[:2]
     # Pixels of the whole image per pixel of the crop.
-    scale = height / whole_size(crop, camera.fovy, side, side)[0]
-    reach = scale * side / 2
-    x = min(max(float(place[0]) * width, reach), width - reach)
-    y = min(max(float(place[1]) * height, reach), height - reach)
+    scale = height / whole_size(crop, camera.fovy, *size)[0]
+    down, across = (scale * side / 2 for side in size)
+    x = min(max(float(place[0]) * width, across), width - across)
+    y = min(max(float(place[1]) * height, down), height - down)
     # The centre of the first pixel is at 0, its corner at -0.5.
-    first = 0.5 * scale - 0.5 - reach
-    affine = np.array([[scale, 0.0, x + first], [0.0, scale, y + first]])
-    part = cv2.warpAffine(
-        image, affine, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    )
+    first = 0.5 * scale - 0.5
+    affine = np.array([[scale, 0.0, x + (first - across)], [0.0, scale, y + (first - down)]])
+    part = cv2.warpAffine(image, affine, size[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     return np.asarray(part, np.uint8)

@@ -10,6 +10,9 @@ pixel's sensitivity is the mean over the squares that hide it.
 
 Each covered image is shown to a separate slot that has seen everything the acting one has, so a
 policy with memory answers as it would in the episode.
+
+Where a detector aims the crops (`aimed_agent`), the squares lie in the crops that it cut: the
+detector sees whole images, without squares.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,11 +27,14 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.agent import Agent, Env, FeatureTable, Observation
+from surgicai_vision.evaluation.aimed_agent import AimedAgent
 from surgicai_vision.evaluation.slot import env_of
 from surgicai_vision.scene.rendering import Frame
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from surgicai_vision.detection.detector import Detector
 
 Image = NDArray[np.uint8]
 HOT = (255.0, 32.0, 0.0)
@@ -100,7 +106,12 @@ def overlaid(one: Sensitivity, largest: float) -> Image:
 
 
 def occlusion(
-    agent: Agent, config: TaskConfig, seed: int, steps: Sequence[int], patch: int
+    agent: Agent,
+    config: TaskConfig,
+    seed: int,
+    steps: Sequence[int],
+    patch: int,
+    detector: "Detector | None" = None,
 ) -> Occlusion:
     """Run one episode of `agent` and hide parts of its images at the chosen steps.
 
@@ -110,14 +121,16 @@ def occlusion(
         seed: of the start.
         steps: control steps, from 0; those after the episode's end are left out.
         patch: side of the hidden square [px].
+        detector: aims the agent's crops; None leaves them where the arm reports its jaws.
 
     Raises:
         InputError: a policy without images or of the whole procedure, no step within the episode,
             or a square that does not fit into the image.
     """
     _check(agent, config, steps, patch)
-    env = env_of(agent, config)
-    places = squares(agent.image_size, patch)
+    aim = None if detector is None else AimedAgent(agent, detector)
+    env = env_of(aim or agent, config)
+    places = squares(agent.image_size, round(agent.image_size * agent.aspect), patch)
     hidden = [(view, place) for view in agent.cameras for place in places]
     wanted = sorted(set(steps))
     asked = {
@@ -134,7 +147,7 @@ def occlusion(
     ended = False
     while not ended:
         features.clear()
-        seen = _drawn(observation)
+        seen = _drawn(aim.crops(observation) if aim else observation)
         now = asked.pop(taken, range(0))
         later = [slot for slots in asked.values() for slot in slots]
         others = [_without(seen, view, place) for view, place in hidden] if now else []
@@ -166,16 +179,17 @@ def _check(agent: Agent, config: TaskConfig, steps: Sequence[int], patch: int) -
         raise InputError(
             f"steps are {', '.join(map(str, steps)) or 'none'}; give at least one, from 0."
         )
-    if not 2 <= patch <= agent.image_size:
-        raise InputError(
-            f"patch is {patch}; it must be between 2 and the image's side, {agent.image_size} px."
-        )
+    side = min(agent.image_size, round(agent.image_size * agent.aspect))
+    if not 2 <= patch <= side:
+        raise InputError(f"patch is {patch}; it must be between 2 and the image's side, {side} px.")
 
 
-def squares(size: int, patch: int) -> list[tuple[slice, slice]]:
-    """Return squares half a side apart that cover an image of `size` [px], rows and columns."""
-    starts = [*range(0, size - patch, max(patch // 2, 1)), size - patch]
-    return [(slice(y, y + patch), slice(x, x + patch)) for y in starts for x in starts]
+def squares(height: int, width: int, patch: int) -> list[tuple[slice, slice]]:
+    """Return squares half a side apart that cover an image [px], rows and columns."""
+    down, across = (
+        [*range(0, size - patch, max(patch // 2, 1)), size - patch] for size in (height, width)
+    )
+    return [(slice(y, y + patch), slice(x, x + patch)) for y in down for x in across]
 
 
 def spread(

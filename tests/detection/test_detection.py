@@ -189,6 +189,8 @@ def test_a_detector_is_kept_and_found_again(demos, tmp_path, in_process, monkeyp
     assert in_process(demos, out) == card
     with pytest.raises(OutputExists, match="another detector"):
         in_process(demos, out, epochs=3)
+    with pytest.raises(OutputExists, match="another detector"):
+        in_process(demos, out, per_demo=3)
     images = np.random.default_rng(0).integers(0, 256, (3, *SIZE, 3)).astype(np.uint8)
     places, sure = load_detector(out).find(images, "back")
     assert places.shape == (3, 2, 2) and (sure > 0).all() and (sure <= 1).all()
@@ -229,6 +231,9 @@ def test_the_command_trains_and_says_how_far_off_it_is(demos, tmp_path, capsys):
     [
         (["--camera", "front_psm2"], "front_psm2 is a crop"),
         (["--camera", "frnt"], "front"),
+        (["--camera", "front,front"], "given twice"),
+        (["--camera", "endo_left"], "allowed: front, back"),
+        (["--camera", "wrist_psm2"], "allowed: front, back"),
         (["--demos", "nowhere"], "nowhere"),
         (["--epochs", "0"], "epochs"),
         (["--demos", "DEMOS,DEMOS"], "given twice"),

@@ -10,7 +10,7 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
-from surgicai_vision.detection.card import DetectorCard
+from surgicai_vision.detection.card import RELEASED, DetectorCard, detector_folder, read_card
 from surgicai_vision.detection.detector import write_detector
 from surgicai_vision.detection.examples import PART, WHOLE
 from surgicai_vision.detection.network import JawNetwork
@@ -21,6 +21,7 @@ from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.robustness import shifted
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.scene.cameras import crop_of
+from surgicai_vision.training.released import VARIABLE
 from surgicai_vision.training.run_config import OWN, RunConfig, of_training
 
 SIDE = 96
@@ -85,7 +86,7 @@ def test_a_crop_is_cut_as_it_is_rendered(view):
     place = np.array(jaws_in_image(env.simulation, crop.camera, crop.arm, WHOLE), np.float32)
     rendered = env.image(view, (SIDE, SIDE))
     whole = env.image(crop.camera, WHOLE)
-    at_place, aside = (cut(whole, crop, place + off, SIDE) for off in (0.0, 0.01))
+    at_place, aside = (cut(whole, crop, place + off, (SIDE, SIDE)) for off in (0.0, 0.01))
     # Only the sampling differs; a hundredth of the image beside it, edges do.
     assert differ(at_place, rendered) < 0.6 * differ(aside, rendered)
     assert differ(at_place, rendered) < 4
@@ -114,7 +115,8 @@ def test_crops_follow_the_jaws_where_cameras_and_joints_are_off():
             crop = crop_of(view)
             place = np.array(jaws_in_image(env.simulation, crop.camera, crop.arm, WHOLE))
             np.testing.assert_array_equal(
-                seen[view], cut(observation[crop.camera], crop, place.astype(np.float32), SIDE)
+                seen[view],
+                cut(observation[crop.camera], crop, place.astype(np.float32), (SIDE, SIDE)),
             )
     assert detector.asked == ["front", "back"] * 3  # one look per camera, whatever the arms
 
@@ -162,3 +164,47 @@ def test_the_commands_refuse_a_folder_without_a_detector(command, tmp_path, caps
     said = capsys.readouterr().err.strip()
     assert "train-detector" in said and "\n" not in said
     assert not (tmp_path / "out").exists()
+
+
+class WideAgent(Looking):
+    """Sees crops that are wider than high."""
+
+    aspect = 4 / 3
+
+
+class DeepAgent(Looking):
+    """Needs the crops' depth."""
+
+    depth = True
+
+
+def test_a_crop_has_the_form_that_the_agent_asks_for():
+    env = envs.make(
+        TaskConfig("place"),
+        obs_type="pixels_agent_pos",
+        cameras=("front", "back"),
+        image_size=WHOLE,
+    )
+    observation, _ = env.reset(seed=names.VALIDATION_SEED)
+    wide, square = (AimedAgent(kind(), TruthDetector(env)) for kind in (WideAgent, Looking))
+    for view in VIEWS[:2]:
+        one, other = (np.array(agent.crops(observation)[view]) for agent in (wide, square))
+        assert one.shape == (SIDE, 128, 3) and other.shape == (SIDE, SIDE, 3)
+        apart = one[:, 16:-16].astype(int) - other  # about the same place, but for rounding
+        assert np.abs(apart).max() <= 1
+
+
+def test_an_agent_that_needs_depth_is_refused(folder):
+    with pytest.raises(InputError, match="needs their depth"):
+        aimed(replace(spec_of(), make=DeepAgent), folder).make_agent()
+
+
+def test_the_released_detector_is_that_of_the_folder_that_is_used_instead(
+    folder, tmp_path, monkeypatch
+):
+    ours = detector_folder(RELEASED)
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "tried"))
+    assert detector_folder(RELEASED) == ours  # policies alone were built there
+    monkeypatch.setenv(VARIABLE, str(folder.parent))
+    assert detector_folder(RELEASED) == folder
+    assert aimed(spec_of(), RELEASED).run.detector == read_card(folder).weights_sha256

@@ -1,5 +1,7 @@
 """Occlusion sensitivity: only what matters is found; each slot's memory is separate."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -70,9 +72,15 @@ def test_only_what_it_looks_at_matters(found):
 
 
 def test_squares_cover_the_image_and_colour_says_how_much(found):
-    for size, patch in ((48, 8), (50, 16), (16, 16)):
-        count = np.zeros((size, size))
-        for place in squares(size, patch):
+    for height, width, patch in (
+        (48, 48, 8),
+        (50, 50, 16),
+        (16, 16, 16),
+        (48, 64, 8),
+        (50, 36, 16),
+    ):
+        count = np.zeros((height, width))
+        for place in squares(height, width, patch):
             count[place] += 1
         assert count.min() >= 1
     first = found.found[0]
@@ -105,3 +113,71 @@ def test_the_command_draws_a_sheet(tmp_path):
     result = saliency.run(options, console=Console())
     assert result["steps"] == 2 and (tmp_path / "saliency.png").stat().st_size > 10_000
     assert module.COVER < 1
+
+
+class WideAgent(CornerAgent):
+    """Sees images that are wider than high."""
+
+    aspect = 4 / 3
+
+
+def test_an_image_that_is_wider_than_high_is_covered_whole():
+    found = occlusion(WideAgent(), CONFIG, seed=3, steps=(0,), patch=8)
+    assert [one.change.shape for one in found.found] == [(SIZE, 64)] * 2
+    assert all(np.isfinite(one.change).all() for one in found.found) and found.largest > 0
+
+
+class CropAgent(CornerAgent):
+    """Looks at the middle of a crop."""
+
+    cameras = ("front_psm2",)
+
+    def act(self, slots, robots, observations):
+        middle = slice(SIZE // 2 - 4, SIZE // 2 + 4)
+        actions = np.zeros((len(slots), 7), np.float32)
+        actions[:, 0] = [
+            frame_of(seen, "front_psm2")[middle, middle].std() for seen in observations
+        ]
+        return actions
+
+
+class FixedDetector:
+    """Sees both arms' jaws at one place; counts how often it was asked."""
+
+    def __init__(self, place):
+        self.place, self.asked = place, 0
+
+    def find(self, images, camera):
+        self.asked += 1
+        return np.full((1, 2, 2), self.place, np.float32), np.ones((1, 2), np.float32)
+
+
+def test_parts_of_aimed_crops_are_hidden_from_the_policy_and_not_from_the_detector():
+    detectors = FixedDetector(0.4), FixedDetector(0.6)
+    one, other = (
+        occlusion(CropAgent(), CONFIG, 3, (0,), 16, detector).found[0] for detector in detectors
+    )
+    assert one.view == "front_psm2" and one.image.shape == (SIZE, SIZE, 3)
+    assert not np.array_equal(one.image, other.image) and one.change.max() > 0
+    assert [detector.asked for detector in detectors] == [CONFIG.max_steps] * 2
+
+
+def make_crop_agent():
+    return CropAgent()
+
+
+def test_the_command_aims_the_crops(tmp_path, capsys):
+    options = saliency.Options(
+        policy=f"{__name__}:make_crop_agent",
+        task="grasp",
+        step=(0,),
+        patch=16,
+        detector="released:detector",
+        out=tmp_path / "saliency.png",
+        env={"max_steps": 2},
+    )
+    result = saliency.run(options, console=Console())
+    assert "-aimed-" in result["policy"] and (tmp_path / "saliency.png").stat().st_size > 10_000
+    refused = replace(options, policy=f"{__name__}:make_agent")
+    with pytest.raises(InputError, match="aims crops"):
+        saliency.run(refused, console=Console())

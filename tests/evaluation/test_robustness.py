@@ -1,7 +1,7 @@
 """Robustness: strength 0 is plain, strengths are paired, an axis changes only what it names."""
 
 import json
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -23,7 +23,7 @@ from surgicai_vision.evaluation.robustness.corrupted_agent import CorruptedAgent
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.statistics import clopper_pearson, mcnemar
 from surgicai_vision.evaluation.storage import MARKER, read_rows
-from surgicai_vision.scene import needle
+from surgicai_vision.scene import build_scene, needle
 from surgicai_vision.training.run_config import OWN, RunConfig
 
 SEEDS = range(names.TEST_SEED, names.TEST_SEED + 2)
@@ -333,6 +333,19 @@ def test_what_a_kill_left_beside_the_plain_evaluation_is_not_copied(tmp_path, pr
     curves.robustness(seeing_spec(), seeds, tmp_path, silent, ("light", "blur"), (0.0, 1.0))
     assert not (tmp_path / "blur" / "0" / "finished").exists()
     assert repr(read_rows(tmp_path / "blur" / "0")) == repr(read_rows(tmp_path / "light" / "0"))
+
+
+def test_curves_of_another_scene_are_not_continued(tmp_path, pretend):
+    curves.robustness(seeing_spec(), SEEDS, tmp_path, silent, ("light",), (0.0,))
+    marker = tmp_path / "light" / "0" / MARKER
+    stored = json.loads(marker.read_text())
+    for scene, is_refused in ((build_scene(SHORT.scene).hash, False), ("0" * 64, True)):
+        stored["about"]["scene_hash"] = scene
+        marker.write_text(json.dumps(stored))
+        refusal = pytest.raises(OutputExists, match="of scene 000000000000")
+        with refusal if is_refused else nullcontext():
+            curves.robustness(seeing_spec(), SEEDS, tmp_path, silent, ("light",), (0.0, 1.0))
+    assert pretend.calls == [("light", 0.0), ("light", 1.0)]
 
 
 @pytest.mark.parametrize("key", ["checkpoint", "dataset", "parts"])

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from surgicai_vision.core import files
 from surgicai_vision.core.config import to_mapping
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, OutputExists, check_name
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.robustness import CURVES, MARK, STRENGTHS
@@ -41,6 +41,7 @@ from surgicai_vision.evaluation.storage import (
     read_rows,
     read_versioned,
 )
+from surgicai_vision.scene import build_scene
 from surgicai_vision.training.run_config import Shift
 
 
@@ -71,11 +72,12 @@ def robustness(
         UnknownName: an axis that does not exist.
         InputError: strengths out of range or order, seeds that `check_seeds` refuses, or an axis
             of images for a policy that sees none.
-        OutputExists: `out` holds the curves of another policy or of other starts.
+        OutputExists: `out` holds the curves of another policy, of other starts or of another scene.
     """
     chosen = _checked(spec, axes, strengths)
     check_seeds(seeds)
     _claim(out, spec, seeds)
+    _check_scene(out, spec)
     places = [out / axis / f"{0.0:g}" for axis in AXES]
     plain = next((place for place in places if (place / MARKER).exists()), None)
     for axis in chosen:
@@ -131,6 +133,18 @@ def _checked(spec: PolicySpec, axes: Sequence[str], strengths: Sequence[float]) 
 
 def _list(items: Sequence[object]) -> str:
     return ", ".join(map(str, items)) or "none"
+
+
+def _check_scene(out: Path, spec: PolicySpec) -> None:
+    """Refuse a folder with evaluations in another scene, which cannot be paired with new ones."""
+    present = build_scene(spec.config.scene).hash
+    for folder in find_evaluations(out):
+        made_in = read_evaluation(folder).about.get("scene_hash")
+        if made_in not in (None, present):
+            raise OutputExists(
+                f"{out} holds curves of scene {made_in[:12]}, and the present scene is "
+                f"{present[:12]}; give another --out."
+            )
 
 
 def _claim(out: Path, spec: PolicySpec, seeds: Sequence[int]) -> None:
