@@ -155,8 +155,8 @@ def explain(error: CycloptsError) -> InputError:
         case MissingArgumentError(keyword=str() as option):
             problem = f"{option} needs a value"
         case MissingArgumentError(argument=Argument(index=index, parameter=parameter, name=name)):
-            option = "" if index is not None else f"{name} "
-            problem = f"{option}{parameter.metavar} is missing"
+            option = "" if index is not None else name
+            problem = f"{option} {parameter.metavar or ''}".strip() + " is missing"
         case _:
             error.verbose = False
             problem = str(error).replace('"', "'").rstrip(".")

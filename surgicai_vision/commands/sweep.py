@@ -126,9 +126,13 @@ def _list(
     grid: "Experiment", out: Path, choice: "Choice", workers: int, console: Console
 ) -> dict[str, object]:
     """Print each run's state, and how long the rest takes if a finished run can tell."""
+    from surgicai_vision.evaluation.storage import GRID_FILE
+    from surgicai_vision.experiments.sweep.driver import continued
     from surgicai_vision.experiments.sweep.estimate import estimate
     from surgicai_vision.experiments.sweep.plan import NOT_RUN, STATES, lacking, plan
 
+    if (out / GRID_FILE).exists():
+        continued(grid, out)
     states = plan(grid, out, choice)
     for state in states:
         line = f"{state.state:<8} {state.key}  {state.where}"

@@ -226,7 +226,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         seed=options.seed,
     )
     # Refuses a recipe that does not exist before any work.
-    policies.check_progress_from(policies.recipe_of(run), options.progress_from)
+    recipe = policies.recipe_of(run)
+    policies.check_progress_from(recipe, options.progress_from)
     shown = options.task if options.dataset else run.task
     rendered = folders.open_dataset(options.dataset, shown, run.views)
     task = rendered.config.task
@@ -244,8 +245,11 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         )
     dataset: Dataset = rendered
     if options.demonstrations or options.subtask:
-        from surgicai_vision.dataset.subset import first_episodes, of_subtask
+        from surgicai_vision.dataset.subset import first_episodes, of_subtask, with_frame_stride
 
+        if not options.subtask:  # whose stride counts from the beginning of its visits
+            # In this order they are the first frames of all that are encoded without the option.
+            dataset = with_frame_stride(dataset, recipe.frame_stride)
         if options.demonstrations:
             dataset = first_episodes(dataset, options.demonstrations)
         if options.subtask:

@@ -28,7 +28,7 @@ from surgicai_vision.evaluation.overlay import video_frames
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.slot import Slot
 from surgicai_vision.evaluation.storage import Row
-from surgicai_vision.training.released import is_released
+from surgicai_vision.experiments.quickstart_config import Quickstart
 
 MARKER: Final = "procedure.json"
 VIDEO: Final = "procedure.mp4"
@@ -65,14 +65,14 @@ class Sewer:
 
 
 def find_sewer(given: str) -> Sewer:
-    """Return who sews: the requested policy or, if a released one cannot be used, the expert.
+    """Return who sews: the requested policy or, if the default cannot be used, the expert.
 
     Args:
-        given: whatever `open_policy` takes for a whole procedure. A released policy that is not
-            there, or of another scene, is replaced by the scripted expert.
+        given: whatever `open_policy` takes for a whole procedure. The default, a released policy,
+            is replaced by the scripted expert where it is not there or of another scene.
 
     Raises:
-        InputError: it cannot sew a whole procedure.
+        InputError: it does not exist, or cannot sew a whole procedure.
     """
     expert = "the scripted expert, which reads the simulator's state and sees no image"
     if given == "expert":
@@ -80,7 +80,7 @@ def find_sewer(given: str) -> Sewer:
     try:
         spec = open_policy(given, task=names.SUTURE)
     except InputError as error:
-        if not is_released(given):
+        if given != Quickstart.procedure:
             raise
         why = str(error).removeprefix(given).removeprefix(":").strip()
         return Sewer(open_policy("expert", task=names.SUTURE), "expert", expert, why)

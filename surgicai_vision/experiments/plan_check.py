@@ -1,11 +1,12 @@
 """Checks of a plan: what is refused before any work; see `plan_config`."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from surgicai_vision.core import names
 from surgicai_vision.core.banks import BANKS
-from surgicai_vision.core.config import JSON
+from surgicai_vision.core.config import JSON, TaskConfig, to_mapping
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.evaluation.hierarchical_config import HLP
 from surgicai_vision.evaluation.robustness.axes import AXES
@@ -17,6 +18,7 @@ from surgicai_vision.experiments.dataset_config import (
 )
 from surgicai_vision.experiments.plan_parts import PARTS, Condition, PlannedPolicy
 from surgicai_vision.features import encoders
+from surgicai_vision.training.policies import POLICIES
 from surgicai_vision.training.run_config import RunConfig
 
 if TYPE_CHECKING:
@@ -36,6 +38,13 @@ def check_plan(plan: "Plan") -> None:
     if parts:
         _check_different("parts", parts)
     _check_different("conditions", [condition.name for condition in plan.conditions])
+    for what, named in (
+        ("demonstrations", plan.demonstrations),
+        ("policies", plan.policies),
+        ("conditions", plan.conditions),
+    ):
+        for each in named:
+            _check_folder_name(what, each.name)
     _check_different("seed", plan.seed)
     for seed in plan.seed:
         first_seed(seed)
@@ -50,8 +59,10 @@ def check_plan(plan: "Plan") -> None:
             )
         _check_visits(plan, recorded)
         _check_multiplied(plan, recorded)
+        _check_built_on(plan, recorded)
     for policy in plan.policies:
         _check_policy(plan, policy)
+    _check_parts(plan)
     for recorded in plan.demonstrations:
         _check_learner(plan, recorded)
     for condition in plan.conditions:
@@ -75,6 +86,22 @@ def _check_visits(plan: "Plan", recorded: Demonstrations) -> None:
     whole = [each.name for each in plan.demonstrations if each.task == names.SUTURE]
     check_name("demonstrations of the whole procedure", recorded.visits_of, whole)
     check_name("task that is visited", recorded.task, names.SUBTASKS)
+    visited = next(each for each in plan.demonstrations if each.name == recorded.visits_of)
+    limit = TaskConfig(recorded.task).max_steps  # a visit's, as `demos.cut` gives it
+    visit = replace(plan.recorded_env(visited, recorded.task), max_steps=limit)
+    _check_same_env(recorded, plan.recorded_env(recorded), visited, visit)
+
+
+def _check_same_env(
+    recorded: Demonstrations, env: TaskConfig, other: Demonstrations, theirs: TaskConfig
+) -> None:
+    """Refuse to render demonstrations of two envs into one dataset."""
+    if env != theirs:
+        raise InputError(
+            f"demonstrations {recorded.name}: they are rendered with those of '{other.name}', so "
+            "both need the same task, env and step limit; give both the same env, without "
+            "max_steps where visits are cut."
+        )
 
 
 def _check_looks(plan: "Plan", recorded: Demonstrations) -> None:
@@ -97,6 +124,16 @@ def _check_multiplied(plan: "Plan", recorded: Demonstrations) -> None:
         each.name for each in plan.demonstrations if each.task == recorded.task and not each.of
     ]
     check_name(f"demonstrations of {recorded.task} that are not multiplied", recorded.of, first)
+
+
+def _check_built_on(plan: "Plan", recorded: Demonstrations) -> None:
+    """Refuse to build on demonstrations in which a learner acts: none acts where they are made."""
+    for each in plan.demonstrations:
+        if each.learner and each.name in (recorded.of, recorded.visits_of):
+            raise InputError(
+                f"demonstrations {recorded.name}: '{each.name}', which they build on (of or "
+                f"visits_of), has a learner, '{each.learner}'; name demonstrations without one."
+            )
 
 
 def _check_learner(plan: "Plan", recorded: Demonstrations) -> None:
@@ -123,6 +160,8 @@ def _check_learner(plan: "Plan", recorded: Demonstrations) -> None:
         learner = learned.learner
     if not recorded.learner:
         return
+    before = plan.recorded(policies[recorded.learner])
+    _check_same_env(recorded, plan.recorded_env(recorded), before, plan.recorded_env(before))
     first = plan.dataset(recorded, plan.seed[0])
     if first.next_seed > first_seed(plan.seed[0]) + SEEDS_EACH:
         raise InputError(
@@ -144,12 +183,34 @@ def _check_policy(plan: "Plan", policy: PlannedPolicy) -> None:
     encoders.check_encoder_name(policy.encoder or plan.encoder)
 
 
+def _check_parts(plan: "Plan") -> None:
+    """Refuse a policy that cannot do its part of the whole procedure.
+
+    A policy called like a part need not do it where there is no whole procedure.
+    """
+    parts = plan.suture if names.SUTURE in plan.names else {}
+    given = {policy.part: policy for policy in plan.policies if policy.part}
+    for part, policy in {**parts, **given}.items():
+        is_ours = POLICIES.is_ours(policy.policy)  # what others do is known when it is trained
+        if is_ours and (policy.policy == HLP) != (part == HLP):
+            raise InputError(
+                f"policies: '{policy.name}' is to do the part '{part}', and its policy is "
+                f"'{policy.policy}'; '{HLP}' does the part '{HLP}', and no other."
+            )
+        task = policy.subtask or plan.recorded(policy).task
+        if part not in (HLP, task):
+            raise InputError(
+                f"policies: '{policy.name}' is to do the part '{part}', and it is trained on "
+                f"'{task}'; name demonstrations of '{part}', or give subtask: {part}."
+            )
+
+
 def _check_condition(plan: "Plan", condition: Condition) -> None:
     """Refuse a condition for what is not trained, or that no env or procedure accepts."""
     evaluated = [policy.name for policy in plan.policies if policy.acts]
+    plan.hierarchical(condition, {})
     if names.SUTURE in plan.names:
         evaluated.append(names.SUTURE)
-        plan.hierarchical(condition, {})
     for name in condition.policies:
         check_name("policy that is evaluated", name, evaluated)
     for seed in condition.seed:
@@ -158,11 +219,17 @@ def _check_condition(plan: "Plan", condition: Condition) -> None:
     _check_env(f"condition {condition.name}", {**plan.env, **condition.env}, "evaluated")
     plan.task_config(names.SUTURE, condition)
     if condition.aimed:
-        for name in condition.policies or evaluated:
+        unless_named = [name for name in evaluated if name in plan.names]
+        for name in condition.policies or unless_named:
             acting = plan.suture.values() if name == names.SUTURE else (plan.policy(name),)
-            for policy in acting:
-                for view in policy.view:
-                    check_name("crop that a detector can aim", view, names.CROPS)
+            views = [view for policy in acting for view in policy.view]
+            for view in views:
+                check_name("crop that a detector can aim", view, names.CROPS)
+            if not views:
+                raise InputError(
+                    f"condition {condition.name}: a detector aims crops, and '{name}' sees no "
+                    "images; name policies that see crops, or leave aimed out."
+                )
     if condition.shift is not None:
         check_name("axis", condition.shift.axis, AXES)
         if not 0 <= condition.shift.strength <= 1:
@@ -173,16 +240,48 @@ def _check_condition(plan: "Plan", condition: Condition) -> None:
 
 
 def _check_runs(plan: "Plan") -> None:
-    """Refuse policies whose runs are equal: the results of one would stand for the other's."""
+    """Refuse policies whose runs are equal: the results of one would stand for the other's.
+
+    Policies that are the same but for names are one: their results are the same.
+    """
     evaluated: dict[RunConfig, str] = {}
     for run, name, _ in plan.evaluations():
         first = evaluated.setdefault(run, name)
-        if first != name:
+        if first != name and _learned(plan, first) != _learned(plan, name):
             raise InputError(
                 f"policies '{first}' and '{name}' have the same run, which records neither their "
                 "names nor everything about their demonstrations (jaw_noise, upset_fraction, "
                 "late, …); evaluate one of them in another plan."
             )
+
+
+def _learned(plan: "Plan", name: str) -> JSON:
+    """Return what a policy is trained on as plain data, without the names of demonstrations."""
+    policy = plan.policy(name)
+    dataset = plan.dataset(plan.recorded(policy), plan.seed[0])
+    return [policy.subtask, _unnamed(to_mapping(dataset))]
+
+
+def _unnamed(table: JSON) -> JSON:
+    """Return plain data of a dataset without the names of demonstrations."""
+    if not isinstance(table, dict):
+        return table
+    called = ("name", "of", "visits_of")
+    return {key: _unnamed(value) for key, value in table.items() if key not in called}
+
+
+def _check_folder_name(what: str, name: str) -> None:
+    """Refuse a name that cannot be a folder's, and that of the whole procedure for a policy."""
+    if not name or name.startswith(".") or "/" in name or "\0" in name:
+        raise InputError(
+            f"{what}: a name is '{name}'; folders have these names, so give at least one "
+            "character, none of them '/', and no '.' at the beginning."
+        )
+    if (what, name) == ("policies", names.SUTURE):
+        raise InputError(
+            f"policies: '{name}' is the whole procedure by all its parts; give the policy another "
+            "name."
+        )
 
 
 def _check_different(what: str, values: Sequence[object]) -> None:

@@ -80,6 +80,7 @@ from surgicai_vision.experiments.plan_parts import (
 )
 from surgicai_vision.experiments.sweep.experiment import Evaluated, Training
 from surgicai_vision.training.run_config import (
+    BUDGET,
     OWN,
     RunConfig,
     Starts,
@@ -213,8 +214,9 @@ class Plan:
     def training(self, policy: PlannedPolicy, seed: int) -> RunConfig:
         """Return the training of a policy."""
         recorded = self.recorded(policy)
+        lengths = ("epochs", BUDGET) if self.epochs else ()  # of the training, which the plan's is
         changes = tuple(
-            change for change in policy.change if not (self.epochs and change.startswith("epochs="))
+            change for change in policy.change if change.partition("=")[0] not in lengths
         )
         return RunConfig(
             self.recorded_env(recorded, policy.subtask),

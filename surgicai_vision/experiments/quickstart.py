@@ -15,27 +15,24 @@ from dataclasses import replace
 from pathlib import Path
 
 from surgicai_vision.core import files, names
-from surgicai_vision.core.config import TaskConfig, to_mapping
+from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.percentages import interval
 from surgicai_vision.core.progress import timed
 from surgicai_vision.dataset import open_dataset
-from surgicai_vision.dataset.layouts import SURGICAI
-from surgicai_vision.dataset.render import check_request
-from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import FORMAT, RUN_FILE, Row, read_versioned
 from surgicai_vision.experiments.first_stitch import POSTER, STRIP, VIDEO, Sewer, find_sewer, sew
-from surgicai_vision.experiments.prepare import prepare_dataset
+from surgicai_vision.experiments.prepare import check_dataset, make_dataset
 from surgicai_vision.experiments.quickstart_config import Quickstart
 from surgicai_vision.experiments.run import train_run
+from surgicai_vision.experiments.training_check import check_training
 from surgicai_vision.features import encoders
 from surgicai_vision.report import write_report
 from surgicai_vision.scene.opengl import check_opengl
-from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import CARD
 from surgicai_vision.training.run_config import RunConfig, Starts
 
@@ -60,13 +57,14 @@ def run_quickstart(
 
     Raises:
         MissingWeights: an encoder's weights are not at hand; before any work.
-        InputError: images that cannot be rendered, or not on this machine; before any work.
+        InputError: images that cannot be rendered, or not on this machine, or a policy that cannot
+            be trained on them; before any work.
         UnknownName: a recipe that does not exist; before any work.
         OutputExists: `out` holds something else.
     """
-    check_request(plan.view, plan.size, plan.frame_stride, None, SURGICAI)
+    check_dataset(plan.dataset)
     for run in plan.runs:
-        policies.recipe_of(run)
+        check_training(run, plan.dataset, None)
         if run.encoder:
             encoders.find_weights(run.encoder)
     check_opengl()
@@ -119,17 +117,7 @@ def _second_act(
     evaluations = out / "evaluations"
     results: list[Row] = []
     with timed(context.stage, state["seconds"]) as measured:
-        folder = prepare_dataset(
-            TaskConfig(plan.task),
-            out,
-            replace(context, stage=measured),
-            demonstrations=plan.demonstrations,
-            views=plan.view,
-            size=plan.size,
-            depth=False,
-            frame_stride=plan.frame_stride,
-            disturbance=Disturbance(plan.noise),
-        )
+        folder = make_dataset(plan.dataset, out, replace(context, stage=measured))
         dataset = open_dataset(folder)
         state["data"] = (
             f"{plan.demonstrations} demonstrations of the scripted expert, {dataset.length} "

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 from surgicai_vision.core.config import TaskConfig, check_frame_stride
-from surgicai_vision.core.errors import InputError, check_at_least, check_name
+from surgicai_vision.core.errors import InputError, check_at_least
+from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrations
 from surgicai_vision.features import encoders
 from surgicai_vision.training.run_config import RunConfig
 
@@ -75,10 +76,27 @@ class Quickstart:
             if run.encoder:
                 encoders.check_encoder_name(run.encoder)
             for view in run.views:
-                check_name("rendered view", view, self.view)
+                if view not in self.view:
+                    raise InputError(
+                        f"view is {','.join(self.view)}, and policy {run.name} sees '{view}'; add "
+                        "it, or give other policies in a --config file (configs/quickstart.yaml)."
+                    )
         check_at_least(
             1, demonstrations=self.demonstrations, size=self.size, episodes=self.episodes
         )
+
+    @property
+    def dataset(self) -> DatasetConfig:
+        """The dataset of all policies."""
+        recorded = Demonstrations(
+            self.task,
+            self.task,
+            self.demonstrations,
+            self.view,
+            noise=self.noise,
+            frame_stride=self.frame_stride,
+        )
+        return DatasetConfig(TaskConfig(self.task), recorded, self.size)
 
     @property
     def runs(self) -> list[RunConfig]:

@@ -34,12 +34,17 @@ from surgicai_vision.experiments.dagger import learner_of
 from surgicai_vision.experiments.dataset_config import Demonstrations
 from surgicai_vision.experiments.plan_config import Plan, plan_of
 from surgicai_vision.experiments.plan_parts import PlannedPolicy
-from surgicai_vision.experiments.prepare import check_dataset, demos_folders, make_dataset
+from surgicai_vision.experiments.prepare import (
+    check_dataset,
+    check_world,
+    demos_folders,
+    make_dataset,
+)
 from surgicai_vision.experiments.run import train_run
+from surgicai_vision.experiments.training_check import check_training
 from surgicai_vision.features import encoders
 from surgicai_vision.scene import build_scene
 from surgicai_vision.scene.opengl import check_opengl
-from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import CARD, WEIGHTS, Checkpoint, read_checkpoint
 from surgicai_vision.training.released import (
     PREFIX,
@@ -73,21 +78,24 @@ def run_release(
 
     Raises:
         UnknownName: a policy, view, encoder or recipe that does not exist; before any work.
-        InputError: a folder that cannot be written, or a machine that cannot render images;
-            before any work.
+        InputError: a policy that cannot be trained as the plan says (`training_check`), a folder
+            that cannot be written, or a machine that cannot render images; before any work.
         MissingWeights: the encoder's weights are not at hand; before any work.
         OutputExists: `out` holds the work of another plan.
     """
     for name in only:
         check_name("policy of the plan", name, plan.names)
     chosen = [name for name in plan.names if name in only or not only]
-    for policy in plan.policies:
-        run = plan.training(policy, plan.seed[0])
-        policies.check_progress_from(policies.recipe_of(run), None)
-        if run.encoder:
-            encoders.find_weights(run.encoder)
     for recorded in plan.demonstrations:
         check_dataset(plan.dataset(recorded, plan.seed[0]))
+    for policy in plan.policies:
+        recorded = plan.recorded(policy)
+        dataset = plan.dataset(recorded, plan.seed[0])
+        run = plan.training(policy, plan.seed[0])
+        check_training(run, dataset, policy.subtask)
+        check_world(dataset.env, f"demonstrations {recorded.name}")
+        if run.encoder:
+            encoders.find_weights(run.encoder)
     _check_writable(released_folder())
     check_opengl()
     scene = build_scene(plan.task_config(names.SUTURE).scene).hash

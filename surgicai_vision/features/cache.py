@@ -49,7 +49,7 @@ from surgicai_vision.core.errors import (
 from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, locked, read_json, write_json
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.core.untrusted import checked
-from surgicai_vision.dataset.subset import whole_of
+from surgicai_vision.dataset.subset import DatasetSubset, whole_of
 
 if TYPE_CHECKING:
     from encoders.base import Encoder
@@ -167,6 +167,9 @@ def encode(
 ) -> Features:
     """Encode one view of a dataset, or return what was encoded before.
 
+    For frames in a row of a dataset that is encoded as a whole, the whole's features are taken: an
+    encoder gives the same image the same feature in every batch.
+
     Args:
         dataset: an opened dataset.
         view: one of its views.
@@ -183,9 +186,10 @@ def encode(
         raise UnknownName("view of this dataset", view, dataset.policy_views)
     if not dataset.length:
         raise InputError("The dataset holds no frames; record and render some first.")
-    folder = (cache_root or default_cache_root()) / "features" / entry_key(dataset, view, encoder)
-    if (folder / MANIFEST).exists():
-        return open_entry(folder, dataset.length)
+    root = cache_root or default_cache_root()
+    if (found := _find(dataset, view, encoder, root)) is not None:
+        return found
+    folder = _entry_folder(dataset, view, encoder, root)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -200,6 +204,25 @@ def encode(
         write_json(folder / MANIFEST, _manifest(dataset, view, encoder))
         (folder / PROGRESS).unlink(missing_ok=True)
     return open_entry(folder, dataset.length, encoded)
+
+
+def _entry_folder(dataset: "Dataset", view: str, encoder: "Encoder", root: Path) -> Path:
+    """Return the folder of an entry in the cache `root`."""
+    return root / "features" / entry_key(dataset, view, encoder)
+
+
+def _find(dataset: "Dataset", view: str, encoder: "Encoder", root: Path) -> Features | None:
+    """Return a dataset's features, or a part of those of its whole; None if neither is there.
+
+    Other frames than neighbours are not taken from the whole: they would be copied into memory.
+    """
+    folder = _entry_folder(dataset, view, encoder, root)
+    if (folder / MANIFEST).exists():
+        return open_entry(folder, dataset.length)
+    if not isinstance(dataset, DatasetSubset) or (np.diff(dataset.rows) != 1).any():
+        return None
+    found = _find(dataset.whole, view, encoder, root)
+    return found and found.part(dataset.rows, dataset.fingerprint)
 
 
 def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Features:

@@ -143,6 +143,7 @@ def test_version(capsys):
         (["evaluate", "--episods=5"], "Did you mean '--episodes'?"),
         (["evaluate", "expert", "--episode", "5"], "Did you mean '--episodes'?"),
         (["evaluate"], "POLICY is missing"),
+        (["submit", "outputs"], "error: --name is missing"),
         (["evaluate", "expert", "expert"], "unexpected argument"),
         (
             ["evaluate", "expert", "--episodes", "-5"],

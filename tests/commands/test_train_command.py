@@ -12,8 +12,10 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import OutputExists
 from surgicai_vision.core.executor import RunContext
+from surgicai_vision.core.files import CACHE_VARIABLE
 from surgicai_vision.dataset import render_demos
 from surgicai_vision.demos.record import record
+from surgicai_vision.features.cache import list_cache
 from surgicai_vision.training.checkpoint import read_checkpoint
 
 
@@ -64,7 +66,7 @@ def test_every_option_is_read_by_some_way_of_training():
     assert set(read) == {field.name for field in dataclasses.fields(train.Options)}
 
 
-def test_imitation_takes_the_first_demonstrations_it_is_told_to(tmp_path, capsys):
+def test_imitation_takes_the_first_demonstrations_it_is_told_to(tmp_path, capsys, monkeypatch):
     record(TaskConfig("grasp"), episodes=2, out=tmp_path / "demos", context=RunContext(0))
     render_demos(
         tmp_path / "demos", tmp_path / "dataset", views=("back",), size=32, context=RunContext(0)
@@ -78,6 +80,18 @@ def test_imitation_takes_the_first_demonstrations_it_is_told_to(tmp_path, capsys
     assert "holds 2" in capsys.readouterr().err and not (tmp_path / "more").exists()
     assert main([*given, "--demos", "demos", "--out", "unread"]) == 2
     assert "'bc' learns from the frames of the dataset" in capsys.readouterr().err
+
+    given = ["train", "--encoder", "random-conv", "--view", "back", "--dataset", "dataset"]
+    given += ["--epochs", "1", "--change", "frame_stride=5"]
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    assert main([*given, "--out", "seeing-all"]) == 0
+    assert main([*given, "--demonstrations", "1", "--out", "seeing-one"]) == 0
+    assert len(list_cache()) == 1, "its features are those of the whole dataset"
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "other-cache"))
+    assert main([*given, "--demonstrations", "1", "--out", "alone"]) == 0
+    shared, alone = (read_checkpoint(tmp_path / out) for out in ("seeing-one", "alone"))
+    assert shared.policy_sha256 == alone.policy_sha256 and shared.frames == alone.frames
+    assert list_cache()[0].manifest["length"] < shared.frames + 5, "the others are not encoded"
 
     given = ["train", "--algo", "bc", "--demos", "demos"]
     assert main([*given, "--demonstrations", "3"]) == 2

@@ -163,7 +163,11 @@ def test_a_field_of_an_env_stands_whole_in_the_place_of_the_plans_and_the_others
 def test_a_step_limit_of_demonstrations_is_no_evaluations():
     """Each policy is evaluated with its task's limit, as in its key; the procedure has its own."""
     env = {"max_steps": 300, "hold_jaw": True}
-    recorded = [{**each, "env": env} for each in TABLE["demonstrations"]]
+    with_visits = {"hold_jaw": True}  # visits have their task's limit, and so have these
+    recorded = [
+        {**each, "env": with_visits if "visits_of" in each else env}
+        for each in TABLE["demonstrations"]
+    ]
     whole = {"name": "all", "view": ["back"], **WHOLE}  # one policy for the whole procedure
     table = {"demonstrations": recorded, "policies": [*TABLE["policies"], whole]}
     plan = plan_of({**TABLE, **table, "conditions": [{"name": "standing"}]}, "a test")

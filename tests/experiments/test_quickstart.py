@@ -15,6 +15,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.video import read_video
+from surgicai_vision.experiments.first_stitch import find_sewer
 from surgicai_vision.experiments.quickstart import run_quickstart
 from surgicai_vision.experiments.quickstart_config import PolicyChoice, Quickstart
 
@@ -77,6 +78,22 @@ def test_a_quickstart_without_policies_is_refused():
         Quickstart(policies=())
 
 
+def test_a_view_that_a_policy_sees_and_nobody_renders_is_refused():
+    with pytest.raises(
+        InputError, match=r"view is front_psm1,back, and policy .* 'back_psm1'; add"
+    ):
+        Quickstart(view=("front_psm1", "back"))
+
+
+def test_only_the_default_procedure_is_replaced_by_the_expert(tmp_path, monkeypatch):
+    monkeypatch.setenv("SURGICAI_VISION_RELEASED", str(tmp_path / "nothing"))
+    sewer = find_sewer("released:suture")
+    assert sewer.name == "expert" and "no policy is released" in sewer.why
+    for given in ("released:sutur", "released:grasp"):
+        with pytest.raises(InputError):
+            find_sewer(given)
+
+
 def test_policies_of_one_name_are_refused():
     """Each has a folder of its name: the second would be taken for the first."""
     two = (PolicyChoice(recipe="paper"), PolicyChoice(recipe="mine/paper.yaml"))
@@ -87,6 +104,20 @@ def test_policies_of_one_name_are_refused():
 def test_images_that_cannot_be_rendered_are_refused_before_any_work(tmp_path):
     with pytest.raises(InputError, match="size is 2000; it must be within"):
         run_quickstart(Quickstart(procedure=None, size=2000), tmp_path, RunContext(0), print)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("choice", "told"),
+    [
+        (PolicyChoice(), "paper uses a frame every 1 steps"),
+        (PolicyChoice("random-conv", ("back",), "maps", "best"), "Unknown pool 'maps'"),
+    ],
+)
+def test_a_policy_that_cannot_be_trained_is_refused_before_any_work(choice, told, tmp_path):
+    built = Quickstart(procedure=None, policies=(choice,))
+    with pytest.raises(InputError, match=told):
+        run_quickstart(built, tmp_path, RunContext(0), print)
     assert not list(tmp_path.iterdir())
 
 

@@ -214,6 +214,25 @@ def test_features_of_some_frames_of_a_dataset_are_kept_with_it(tmp_path: Path) -
     assert left.manifest["dataset"] != "data"
 
 
+def test_frames_in_a_row_of_an_encoded_dataset_are_not_encoded_again(tmp_path: Path) -> None:
+    whole = FakeDataset()
+    first = DatasetSubset(whole, np.arange(9), {"episodes": 2})
+    within = DatasetSubset(first, np.arange(3, 7), {"episodes": 1})
+    spread = DatasetSubset(whole, np.arange(0, 23, 5), {"stride": 5})
+    alone = encode(first, "front", FakeEncoder(), tmp_path / "alone").rows
+    encode(whole, "front", FakeEncoder(), tmp_path)
+    for part, rows in ((first, alone), (within, alone[3:7])):
+        encoder = FakeEncoder()
+        entry = encode(part, "front", encoder, tmp_path)
+        assert (entry.encoded, encoder.seen) == (0, 0)
+        assert entry.manifest["dataset"] == part.fingerprint
+        np.testing.assert_array_equal(entry.rows, rows)
+    assert encode(spread, "front", FakeEncoder(), tmp_path).encoded == 5, (
+        "taken from the whole, these would be copied into memory"
+    )
+    assert encode(first, "back", FakeEncoder(), tmp_path).encoded == 9, "this view is not encoded"
+
+
 def test_cache_root_follows_the_environment(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

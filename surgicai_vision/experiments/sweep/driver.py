@@ -121,7 +121,7 @@ def _open(experiment: Experiment, out: Path) -> None:
     """Make the folder, or accept that of the same experiment and change nothing in it."""
     files.check_output(out, may_resume=GRID_FILE)
     if (out / GRID_FILE).exists():
-        _stored(experiment, out)
+        continued(experiment, out)
         return
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -135,12 +135,17 @@ def _open(experiment: Experiment, out: Path) -> None:
 
 def _extend(experiment: Experiment, out: Path) -> None:
     """Store what is added to the folder's experiment; this call has claimed the folder."""
-    if _stored(experiment, out).table() != experiment.table():
+    if continued(experiment, out).table() != experiment.table():
         _store_table(experiment, out)
 
 
-def _stored(experiment: Experiment, out: Path) -> Experiment:
-    """Return the experiment of the folder, or refuse one that cannot be continued as this one."""
+def continued(experiment: Experiment, out: Path) -> Experiment:
+    """Return the experiment of the folder `out`, which is continued as `experiment`.
+
+    Raises:
+        OutputExists: it is another sweep's folder.
+        BadFile: another version wrote it.
+    """
     stored = read_experiment_of(out)
     if stored.kind != experiment.kind or not experiment.extends(stored.table()):
         raise OutputExists(

@@ -116,6 +116,8 @@ class Experiment(Protocol):
     ) -> Self:
         """Return the experiment with other numbers, to try it in minutes.
 
+        Runs that differ in nothing else become one.
+
         Args:
             demonstrations: of each dataset.
             epochs: passes over the frames, of every policy.

@@ -382,9 +382,13 @@ class Grid:
         size: int | None = None,
     ) -> "Grid":
         """Return the grid with other numbers, to try it in minutes; see `Experiment.smaller`."""
+        ablations = self.ablation
+        if demonstrations is not None:  # all runs have this number, so none can replace it
+            ablations = tuple(each for each in ablations if each.demonstrations is None)
         return replace(
             self,
             demonstrations=self.demonstrations if demonstrations is None else (demonstrations,),
+            ablation=ablations,
             epochs=self.epochs if epochs is None else epochs,
             episodes=self.episodes if episodes is None else episodes,
             size=self.size if size is None else size,

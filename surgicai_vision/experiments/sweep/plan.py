@@ -2,30 +2,37 @@
 
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import CAMERAS
 from surgicai_vision.core.config import JSON, digest, from_mapping, to_identity, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, MissingWeights
 from surgicai_vision.core.executor import Job, register_job
 from surgicai_vision.core.files import read_json
+from surgicai_vision.core.plugins import DISTRIBUTION
+from surgicai_vision.core.tasks import TASKS
 from surgicai_vision.demos.store import demos_digest, list_demos
 from surgicai_vision.envs.upset import check_upset_task
+from surgicai_vision.evaluation.robustness.axes import AXES, shifted_config
 from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_versioned
 from surgicai_vision.experiments.plan_config import plan_of
-from surgicai_vision.experiments.prepare import check_dataset, demos_folders
+from surgicai_vision.experiments.prepare import check_dataset, check_world, demos_folders
 from surgicai_vision.experiments.sweep.experiment import Experiment, Training
 from surgicai_vision.experiments.sweep.grid import Grid
 from surgicai_vision.experiments.sweep.lerobot import OPTIONS
 from surgicai_vision.experiments.sweep.rl_grid import RLGrid
 from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice, is_chosen
+from surgicai_vision.experiments.training_check import check_training
 from surgicai_vision.features import encoders
-from surgicai_vision.features.encoders import WeightsSource
-from surgicai_vision.rl.algorithms import LEARNED
+from surgicai_vision.features.encoders import ENCODERS, WeightsSource
 from surgicai_vision.rl.extra import check_extra
 from surgicai_vision.training import policies
+from surgicai_vision.training.policies import POLICIES
 from surgicai_vision.training.run_config import OWN, RunConfig
 
 REFERENCE_FILE = "reference.json"
@@ -142,10 +149,10 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
     """Return every run of `experiment` with its state in the folder `out`; does no work.
 
     Raises:
-        UnknownName: a recipe, or a change of one, that does not exist.
-        InputError: a recipe with progress as an input, which no sweep provides, a policy that
-            only an algorithm trains, one that chooses subtasks where one that acts is needed, a
-            dataset that cannot be recorded or rendered, or upsets in a task that has none.
+        UnknownName: a recipe, a change of one, or a pool that does not exist.
+        InputError: a policy that cannot be trained on its dataset (`training_check`), one that
+            chooses subtasks where one that acts is needed, a dataset that cannot be recorded or
+            rendered, upsets in a task that has none, or a world that geometry forbids.
     """
     if any(run.algo for run in experiment.runs):
         check_extra("A sweep over algorithms", *LIBRARIES)
@@ -157,32 +164,42 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
     for run in experiment.runs:
         if experiment.needs(run):
             continue
-        for trained in trained_by(experiment, run):
-            if not trained.by_lerobot_train and not trained.algo:
-                _check_imitates(trained.policy)
-                policies.check_progress_from(policies.recipe_of(trained), None)
         if not experiment.parts(run):
             _check_acts(run.policy)
+        for training in trainings_of(experiment, run):
+            if not training.run.algo:
+                dataset = experiment.datasets[training.dataset]
+                check_training(training.run, dataset, training.subtask)
+        if is_chosen(run, choice):
+            _check_worlds(experiment, run)
     jobs = Jobs(experiment, out)
     weights = WeightsSource(accept_licence=experiment.accept_licence)
     missing = functools.lru_cache(functools.partial(_missing, weights=weights))
     return [_state(run, jobs, missing, choice) for run in experiment.runs]
 
 
-def trained_by(experiment: Experiment, run: RunConfig) -> list[RunConfig]:
+def trainings_of(experiment: Experiment, run: RunConfig) -> list[Training]:
     """Return the policies that must be trained for a run.
 
     These are its parts, or its own policy, and the learners that act in their demonstrations.
     """
-    parts = experiment.parts(run).values()
-    own = [part.run for part in parts] or [run]
-    datasets = [part.dataset for part in parts]
-    for name in datasets:  # grows by what the learners are trained on
-        if name in experiment.learners:
-            learner = experiment.learners[name]
-            own.append(learner.run)
-            datasets.append(learner.dataset)
-    return own
+    trainings = list(experiment.parts(run).values())
+    trainings = trainings or [Training(run, experiment.dataset_of(run))]
+    for training in trainings:  # grows by what the learners are trained on
+        if training.dataset in experiment.learners:
+            trainings.append(experiment.learners[training.dataset])
+    return trainings
+
+
+def _check_worlds(experiment: Experiment, run: RunConfig) -> None:
+    """Refuse a run if geometry forbids a world that it is trained or evaluated in."""
+    for training in trainings_of(experiment, run):
+        env = experiment.datasets[training.dataset].env
+        check_world(env, f"demonstrations {training.dataset}")
+    env = run.env
+    if run.shift:
+        env = shifted_config(env, AXES[run.shift.axis], run.shift.strength)
+    check_world(env, f"condition {run.condition}" if run.condition else f"task {run.task}")
 
 
 def _check_acts(policy: str) -> None:
@@ -193,14 +210,6 @@ def _check_acts(policy: str) -> None:
         f"policy: '{policy}' chooses subtasks and does not act; it is evaluated over a policy for "
         "each subtask: write `hierarchical:` instead (docs/sweeps.md)."
     )
-
-
-def _check_imitates(policy: str) -> None:
-    """Refuse a policy that does not learn from demonstrations alone."""
-    if policy in LEARNED:
-        raise InputError(
-            f"policy: '{policy}' is what an algorithm trains; write `algo:` instead (docs/rl.md)."
-        )
 
 
 def _missing(encoder: str, weights: WeightsSource) -> str:
@@ -222,7 +231,8 @@ def _state(run: RunConfig, jobs: "Jobs", missing: Callable[[str], str], choice: 
     is_made = path.exists()
     if is_made and read_json(path).get("job") == jobs.key_of_run(run):
         return RunState(run, key, CACHED)
-    needed = {trained.encoder for trained in trained_by(jobs.experiment, run)} - {None, OWN}
+    trainings = trainings_of(jobs.experiment, run)
+    needed = {training.run.encoder for training in trainings} - {None, OWN}
     lacks = [lack for encoder in sorted(map(str, needed)) if (lack := missing(encoder))]
     if lacks:
         return RunState(run, key, NOT_RUN, " ".join(lacks))
@@ -429,8 +439,9 @@ class Jobs:
             "dataset": self._dataset(replayed) if replayed else "",
             **self._where,
         }
-        inputs = (self.dataset_digest(replayed) or "",) if replayed else ()
-        return Job("sweep-reference", arguments, inputs, label=LABELS)
+        inputs = [self.dataset_digest(replayed) or ""] if replayed else []
+        inputs += _other_versions(run)
+        return Job("sweep-reference", arguments, tuple(inputs), label=LABELS)
 
     def _dataset(self, name: str) -> str:
         return str((self.data_folder(name) / "dataset").absolute())
@@ -444,7 +455,10 @@ class Jobs:
         }
 
     def _inputs(self, run: RunConfig, dataset: str) -> list[str]:
-        """Return what a run depends on: its dataset, its encoder, its recipe or options."""
+        """Return what a run depends on.
+
+        These are its dataset, its encoder, its recipe or options, and other distributions.
+        """
         inputs = [self.dataset_digest(dataset) or ""]
         if run.encoder and run.encoder != OWN:
             inputs.append(_card_digest(run.encoder))
@@ -452,7 +466,7 @@ class Jobs:
             inputs.extend(OPTIONS.get(run.policy, ()))
         else:
             inputs.append(_recipe_digest(run.policy, run.recipe, run.changes, run.privileged))
-        return inputs
+        return [*inputs, *_other_versions(run)]
 
 
 LABELS = ("dataset", "accept_licence", "device", "command", "environment")
@@ -474,3 +488,21 @@ def _recipe_digest(policy: str, recipe: str, changes: tuple[str, ...], privilege
     """Hash a recipe with its changes; read once for all runs that share it."""
     run = RunConfig(policy=policy, recipe=recipe, changes=changes, privileged=privileged)
     return digest(to_mapping(policies.recipe_of(run)))
+
+
+def _other_versions(run: RunConfig) -> list[str]:
+    """Return the name and version of each other distribution whose parts a run uses.
+
+    A part that a script registers without a distribution has no version.
+    """
+    owners = {
+        TASKS.distribution(run.task),
+        POLICIES.distribution(run.policy),
+        ENCODERS.distribution(run.encoder or ""),
+        *(CAMERAS.distribution(names.camera_of(view)) for view in run.views),
+    }
+    versions = []
+    for owner in sorted(owners - {DISTRIBUTION}):
+        with suppress(PackageNotFoundError):
+            versions.append(f"{owner} {version(owner)}")
+    return versions

@@ -93,6 +93,8 @@ class RLGrid:
             check_name("algo or subtask", key, (*ALGORITHMS, *names.SUBTASKS))
         for algo, task in itertools.product(self.algo, self.task):
             settings_of(algo, read_changes(self._changes(algo, task)))  # refuses what is not read
+        if "task" in self.env:
+            raise InputError("env has 'task', which is an axis of its own; leave it out of env.")
         check_name("observation", self.observation, OBSERVATIONS)
         check_name("bank of starts", self.starts, BANKS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
@@ -106,7 +108,7 @@ class RLGrid:
             demonstrations=min(self.demonstrations, default=None),
         )
         check_at_least(0, validation=self.validation)
-        check_at_most(LARGEST_SEED, seed=max(self.seed))
+        check_at_most(LARGEST_SEED, seed=max(self.seed, default=0))
         if self.hierarchical and set(self.task) != set(names.SUBTASKS):
             raise InputError(
                 f"hierarchical needs all of {', '.join(names.SUBTASKS)}; task is "
