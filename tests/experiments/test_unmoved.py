@@ -70,7 +70,7 @@ def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
         "all axes at half strength with aimed crops",
         "needles never seen",
     )
-    assert by_condition(UNMOVED) == dict.fromkeys(conditions, 2 * 7)  # `place` and `insert` twice
+    assert by_condition(UNMOVED) == dict.fromkeys(conditions, 2 * 9)  # all but the grasp twice
     assert {run.task for run in UNMOVED.runs} == set(names.SUBTASKS)
     assert UNMOVED.seed == (0, 1)
     for dataset in UNMOVED.datasets.values():
