@@ -61,10 +61,7 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Run one episode, hide parts of the images at some steps, and draw what mattered."""
-    from surgicai_vision.detection.card import detector_folder
-    from surgicai_vision.detection.detector import load_detector
     from surgicai_vision.envs import contact_sheet
-    from surgicai_vision.evaluation.aimed_agent import aimed
     from surgicai_vision.evaluation.occlusion import occlusion
 
     folders.check_file(options.out, "--out", SUFFIXES)
@@ -74,16 +71,10 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         options.env,
         None,
         WeightsSource.parse(options.weights, options.accept_licence),
+        detector=options.detector,
     )
-    make_agent = spec.make_agent
-    detector = None
-    if options.detector is not None:
-        spec = aimed(spec, options.detector)
-        detector = load_detector(detector_folder(options.detector))
     with console.stage("hiding parts of images"):
-        found = occlusion(
-            make_agent(), spec.config, options.seed, options.step, options.patch, detector
-        )
+        found = occlusion(spec.make_agent(), spec.config, options.seed, options.step, options.patch)
     ended = f"{'success' if found.success else 'failure'} after {found.steps} steps"
     title = f"{spec.name}: {spec.config.task}, start {options.seed}, {ended}"
     contact_sheet.write(found.sheet(title), options.out, dpi=100)

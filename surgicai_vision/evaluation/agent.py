@@ -113,7 +113,7 @@ class Agent(abc.ABC):
 class WrappedAgent(Agent):
     """An agent behind something that changes what it sees; all else is the wrapped agent's.
 
-    Args:
+    Attributes:
         agent: who acts.
     """
 
@@ -126,19 +126,19 @@ class WrappedAgent(Agent):
         self.depth = agent.depth
         self.privileged = agent.privileged
         self.action_mode = agent.action_mode
-        self._agent = agent
+        self.agent = agent
 
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Reset the wrapped agent."""
-        self._agent.reset(slot, robot, seed)
+        self.agent.reset(slot, robot, seed)
 
     def restart(self, slot: int) -> None:
         """Restart the wrapped agent."""
-        self._agent.restart(slot)
+        self.agent.restart(slot)
 
     def share(self, features: FeatureTable) -> None:
         """Let the wrapped agent share features."""
-        self._agent.share(features)
+        self.agent.share(features)
 
 
 MakeAgent = Callable[[], Agent]

@@ -123,7 +123,7 @@ class AimedAgent(WrappedAgent):
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the agent's actions (n, 7) on its crops."""
-        return self._agent.act(slots, robots, [self.crops(seen) for seen in observations])
+        return self.agent.act(slots, robots, [self.crops(seen) for seen in observations])
 
     def crops(self, observation: Observation) -> Observation:
         """Return an observation whose crops are cut when they are accessed."""

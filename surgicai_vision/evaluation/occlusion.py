@@ -34,8 +34,6 @@ from surgicai_vision.scene.rendering import Frame
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from surgicai_vision.detection.detector import Detector
-
 Image = NDArray[np.uint8]
 HOT = (255.0, 32.0, 0.0)
 """Colour of what matters [grey levels of 255]."""
@@ -106,12 +104,7 @@ def overlaid(one: Sensitivity, largest: float) -> Image:
 
 
 def occlusion(
-    agent: Agent,
-    config: TaskConfig,
-    seed: int,
-    steps: Sequence[int],
-    patch: int,
-    detector: "Detector | None" = None,
+    agent: Agent, config: TaskConfig, seed: int, steps: Sequence[int], patch: int
 ) -> Occlusion:
     """Run one episode of `agent` and hide parts of its images at the chosen steps.
 
@@ -121,14 +114,14 @@ def occlusion(
         seed: of the start.
         steps: control steps, from 0; those after the episode's end are left out.
         patch: side of the hidden square [px].
-        detector: aims the agent's crops; None leaves them where the arm reports its jaws.
 
     Raises:
         InputError: a policy without images or of the whole procedure, no step within the episode,
             or a square that does not fit into the image.
     """
+    aim = agent if isinstance(agent, AimedAgent) else None
+    agent = aim.agent if aim else agent
     _check(agent, config, steps, patch)
-    aim = None if detector is None else AimedAgent(agent, detector)
     env = env_of(aim or agent, config)
     places = squares(agent.image_size, round(agent.image_size * agent.aspect), patch)
     hidden = [(view, place) for view in agent.cameras for place in places]

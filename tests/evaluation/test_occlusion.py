@@ -12,6 +12,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.evaluation import occlusion as module
 from surgicai_vision.evaluation.agent import Agent, frame_of
 from surgicai_vision.evaluation.agents import ZeroAgent
+from surgicai_vision.evaluation.aimed_agent import AimedAgent
 from surgicai_vision.evaluation.occlusion import occlusion, overlaid, squares
 
 SIZE = 48
@@ -155,7 +156,8 @@ class FixedDetector:
 def test_parts_of_aimed_crops_are_hidden_from_the_policy_and_not_from_the_detector():
     detectors = FixedDetector(0.4), FixedDetector(0.6)
     one, other = (
-        occlusion(CropAgent(), CONFIG, 3, (0,), 16, detector).found[0] for detector in detectors
+        occlusion(AimedAgent(CropAgent(), detector), CONFIG, 3, (0,), 16).found[0]
+        for detector in detectors
     )
     assert one.view == "front_psm2" and one.image.shape == (SIZE, SIZE, 3)
     assert not np.array_equal(one.image, other.image) and one.change.max() > 0

@@ -54,7 +54,7 @@ class CorruptedAgent(WrappedAgent):
         ]
         for slot in slots:
             self._steps[slot] += 1
-        return self._agent.act(slots, robots, seen)
+        return self.agent.act(slots, robots, seen)
 
     def _seen(self, slot: int, observation: Observation) -> Observation:
         """Return an observation whose images are corrupted when they are accessed."""
