@@ -112,6 +112,10 @@ class Demonstrations:
             return None
         return Variants(self.appearance, self.distractors, self.variants, self.corruption)
 
+    def shown(self, env: TaskConfig) -> TaskConfig:
+        """Return the task as their images show it, where it is recorded in `env`."""
+        return self.looks.shown(env) if self.looks else env
+
     @property
     def disturbance(self) -> Disturbance:
         """What disturbs their episodes."""

@@ -106,8 +106,7 @@ def _check_same_env(
 
 def _check_looks(plan: "Plan", recorded: Demonstrations) -> None:
     """Refuse to render looks that are held out for tests: no policy may learn from them."""
-    env = plan.recorded_env(recorded)
-    shown = recorded.looks.shown(env) if recorded.looks else env
+    shown = recorded.shown(plan.recorded_env(recorded))
     if recorded.view and shown.randomisation.shows_heldout:
         raise InputError(
             f"demonstrations {recorded.name} would show looks that are held out for tests "

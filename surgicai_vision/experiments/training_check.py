@@ -82,8 +82,7 @@ def _held(dataset: DatasetConfig) -> int:
 
 def _check_looks(run: RunConfig, dataset: DatasetConfig) -> None:
     """Refuse to learn from looks that are held out for tests."""
-    recorded = dataset.demonstrations
-    shown = recorded.looks.shown(dataset.env) if recorded.looks else dataset.env
+    shown = dataset.demonstrations.shown(dataset.env)
     if run.views and shown.randomisation.shows_heldout:
         raise InputError(
             f"demonstrations of '{dataset.env.task}' would show looks that are held out for tests "
