@@ -39,8 +39,9 @@ FIGURE_SUFFIXES = (".png", ".jpg", ".pdf", ".svg")
 ALL = "all"
 PLAIN = "plain"
 FAMILIES = {
-    ALL: ("", *names.APPEARANCES),
+    ALL: ("", *names.TRAIN_APPEARANCES, *names.HELDOUT_APPEARANCES),
     names.TRAIN: names.TRAIN_APPEARANCES,
+    names.VARIED: names.VARIED_APPEARANCES,
     names.HELDOUT: names.HELDOUT_APPEARANCES,
     PLAIN: ("",),
     **{name: (name,) for name in names.APPEARANCES},
@@ -66,7 +67,7 @@ class Options:
         animation: Instead of the sheet, the expert's episode as an animation, in the first view.
         axes: Instead of the sheet, every axis of `robustness` at every strength, in the first view.
         looks: Instead of the sheet, a row per family of looks: every view at seeds from --seed on.
-        appearance: Families shown by --looks: all, train, heldout, plain, or names of families.
+        appearance: Families shown by --looks: all (plain, train, heldout), varied, or names of families.
         draws: Number of seeds shown by --looks.
         distractors: Largest number of distractor objects in --looks, 0 to 5.
         needles: Instead of the sheet, every needle that randomisation can draw, in the first view.

@@ -176,7 +176,7 @@ RANDOMISATION_CHOICES: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
     {
         "pair": ("", ANY),
         "needle_arc": tuple(CHOSEN_ARCS),
-        "appearance": ("", names.TRAIN, names.HELDOUT, *names.APPEARANCES),
+        "appearance": ("", names.TRAIN, names.VARIED, names.HELDOUT, *names.APPEARANCES),
     }
 )
 """Axis that is a choice → its possible values; "" is off."""
@@ -221,9 +221,10 @@ class RandomisationConfig:
         needle_arc: how much of a circle the needle is: one of `NEEDLE_ARCS`, or "any" of them;
             "train" draws one to train on, a third (in two of three episodes) or a half, "heldout"
             the one that is kept for tests; "" takes the scene's, a third.
-        appearance: "train" draws one of the five families of looks for training, "heldout" one of
-            those kept for tests, a family's name takes that one; within it every episode has its
-            own look. "" takes the plain look. See docs/looks.md.
+        appearance: "train" draws one of the five families of looks for training, "varied" one of
+            the same with random surroundings, "heldout" one of those kept for tests, a family's
+            name takes that one; within it every episode has its own look. "" takes the plain look.
+            See docs/looks.md.
         distractors: largest number of distractor objects, 0 to 5: a second needle, gauze, a clip,
             cut thread, blood. Each episode draws how many. They are visual only.
         appearance_shift: how far each episode's look is shifted towards one of a held-out family,

@@ -60,13 +60,17 @@ MODALITIES = (RGB, DEPTH, SEGMENTATION)
 PARTS = ("background", "phantom", "needle", "thread", "psm1", "psm2")
 """Named parts; a part's index is its value in a segmentation image."""
 
-APPEARANCES = ("silicone", "mucosa", "skin", "muscle", "fat", "liver", "bowel", "scar")
-"""Families of looks (`scene.visual.families`). A state holds a family's index here: only append."""
+TRAIN_APPEARANCES = ("silicone", "mucosa", "skin", "muscle", "fat")
+"""Families of looks for training."""
 HELDOUT_APPEARANCES = ("liver", "bowel", "scar")
 """Families that no training may see."""
-TRAIN_APPEARANCES = tuple(name for name in APPEARANCES if name not in HELDOUT_APPEARANCES)
+VARIED_APPEARANCES = tuple(f"varied_{name}" for name in TRAIN_APPEARANCES)
+"""The families for training, over cloths and in trays of any colour and of random patterns."""
+APPEARANCES = (*TRAIN_APPEARANCES, *HELDOUT_APPEARANCES, *VARIED_APPEARANCES)
+"""Families of looks (`scene.visual.families`). A state holds a family's index here: only append."""
 TRAIN = "train"
 HELDOUT = "heldout"
+VARIED = "varied"
 """Sets of families, as `RandomisationConfig.appearance` names them."""
 
 OBS_TYPES = ("state", "goal", "relative", "pixels", "pixels_agent_pos")

@@ -14,7 +14,11 @@ from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.scene.visual.appearance import SEEDS, Appearance
 from surgicai_vision.scene.visual.distractors import MOST, Litter
 
-FAMILIES = {names.TRAIN: names.TRAIN_APPEARANCES, names.HELDOUT: names.HELDOUT_APPEARANCES}
+FAMILIES = {
+    names.TRAIN: names.TRAIN_APPEARANCES,
+    names.VARIED: names.VARIED_APPEARANCES,
+    names.HELDOUT: names.HELDOUT_APPEARANCES,
+}
 """Set of looks → its families."""
 
 

@@ -1,17 +1,20 @@
 """Families: what belongs together in one appearance, and the bounds within which an episode draws.
 
-`FAMILIES` is the table, in the order of `names.APPEARANCES`. No pattern, finish, lamp or colour of
+`FAMILIES` is the table, in the order of `names.APPEARANCES`. A `varied_` family is one for training
+with random surroundings (`cloths.varied`), of any colour. No pattern, finish, lamp or colour of
 a held-out family is used in a training family (tested in `tests/scene/test_appearance.py`). Colours
 are 0 to 255; they and all bounds were chosen by eye on the contact sheets (`surgicai-vision scene
 --looks FILE`), not measured on tissue.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 
+from surgicai_vision.core import names
 from surgicai_vision.scene.visual import cloths, tissues
 from surgicai_vision.scene.visual.fields import Colour, Image, Size
 
@@ -182,7 +185,7 @@ TUBES = Lamps(
 """Light: a room, a theatre's lamp, an endoscope; held out: a narrow cold spot, low warm light from
 the side, cold tubes without direction."""
 
-FAMILIES: Mapping[str, Family] = MappingProxyType(
+_DRAWN: Mapping[str, Family] = MappingProxyType(
     {
         "silicone": Family(
             tissue=tissues.silicone,
@@ -320,5 +323,19 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
             shaft=GREY_SHAFT,
             lamps=TUBES,
         ),
+    }
+)
+ANY_TRAY = Finish((255.0, 255.0, 255.0), (235.0, 235.0, 235.0), (0.1, 0.7), (0.2, 0.7))
+"""A tray whose texture has its colour."""
+
+FAMILIES: Mapping[str, Family] = MappingProxyType(
+    {
+        **_DRAWN,
+        **{
+            varied: dataclasses.replace(
+                _DRAWN[name], drape=cloths.varied, tray=cloths.varied, tray_finish=ANY_TRAY
+            )
+            for varied, name in zip(names.VARIED_APPEARANCES, names.TRAIN_APPEARANCES, strict=True)
+        },
     }
 )
