@@ -29,6 +29,7 @@ from surgicai_vision.training.checkpoint import (
 )
 from surgicai_vision.training.chunks import earlier_rows
 from surgicai_vision.training.data import cuts, over_places, split
+from surgicai_vision.training.feature_rows import FeatureRows
 from surgicai_vision.training.folder import read_state, write_state
 from surgicai_vision.training.progress_input import copy_progress_policy
 from surgicai_vision.training.request import TrainingRequest
@@ -71,6 +72,7 @@ class Training:
         self.policy = request.untrained()
         fed = [np.asarray(request.columns[key], np.float32) for key in self.policy.inputs.vector]
         self.vector = np.concatenate(fed, axis=1) if fed else None
+        self.features = FeatureRows(request.features, device)
         target = request.columns[request.policy.target]
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
         self.target = torch.from_numpy(target.astype(kind))
@@ -168,17 +170,12 @@ class Training:
         )
 
     def _observed(self, rows: NDArray[np.int64]) -> torch.Tensor:
-        """Return the raw inputs of some frames, (n, inputs) float32.
+        """Return the raw inputs of some frames where the features are, (n, inputs) float32.
 
         The views' features come before the vector.
         """
-        # Each view is copied only once, into place: the maps of a batch are tens of megabytes.
-        observed = torch.empty(len(rows), self.policy.inputs.dim)
-        at = 0
-        for entry in self.request.features:
-            seen = torch.from_numpy(entry.rows[rows])
-            observed[:, at : at + seen.shape[1]] = seen
-            at += seen.shape[1]
+        observed = torch.empty(len(rows), self.policy.inputs.dim, device=self.features.home)
+        at = self.features.write(rows, observed)
         if self.vector is not None:
             observed[:, at:] = torch.from_numpy(self.vector[rows])
         return observed
@@ -200,14 +197,15 @@ class Training:
         pieces = [
             self.rows[at : at + STATISTICS_ROWS] for at in range(0, len(self.rows), STATISTICS_ROWS)
         ]
-        mean = torch.zeros(self.policy.inputs.dim, dtype=torch.float64)
+        home = self.features.home
+        mean = torch.zeros(self.policy.inputs.dim, dtype=torch.float64, device=home)
         squares = torch.zeros_like(mean)
         for piece in pieces:
             mean += self._observed(piece).double().sum(0) / len(self.rows)
         for piece in pieces:
             squares += ((self._observed(piece).double() - mean) ** 2).sum(0) / len(self.rows)
         std = squares.sqrt()
-        mean, std = over_places(mean, std, self.policy.inputs.visual)
+        mean, std = over_places(mean.cpu(), std.cpu(), self.policy.inputs.visual)
         self.policy.input_mean.copy_(mean)
         self.policy.input_std.copy_(torch.where(std > SMALLEST_STD, std, torch.ones_like(std)))
 
