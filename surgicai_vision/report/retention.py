@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from markupsafe import Markup
 
-from surgicai_vision.core import names, percentages
+from surgicai_vision.core import percentages
 from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation import statistics
@@ -186,7 +186,7 @@ def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
         known = replace(item.condition, place="", name="", world="", recorded_in="")
         for result in item.results:
             axes = result.config.randomisation
-            if axes.appearance in (names.TRAIN, *names.TRAIN_APPEARANCES) or axes.shows_heldout:
+            if axes.appearance or axes.shows_heldout:
                 world = replace(axes, appearance="", appearance_shift=0.0)
                 by_look = seen.setdefault((known, item.condition.learned_in, world), _ByLook())
                 kind = by_look.held_out if axes.shows_heldout else by_look.held_in

@@ -38,6 +38,7 @@ def image(env: envs.SuturingEnv) -> np.ndarray:
     ("appearance", "families"),
     [
         ("train", names.TRAIN_APPEARANCES),
+        ("varied", names.VARIED_APPEARANCES),
         ("heldout", names.HELDOUT_APPEARANCES),
         ("bowel", ("bowel",)),
         ("", ("",)),

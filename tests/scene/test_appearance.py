@@ -60,17 +60,45 @@ WHITE = (255.0, 255.0, 255.0)
 """A tint that leaves a texture unchanged, hence no colour in its own right."""
 
 
+SHOWN_IN_TRAINING = (*names.TRAIN_APPEARANCES, *names.VARIED_APPEARANCES)
+
+
 def test_families_are_those_of_the_names_five_to_train_three_held_out():
     assert tuple(FAMILIES) == names.APPEARANCES
     assert len(names.TRAIN_APPEARANCES) == 5
     assert len(names.HELDOUT_APPEARANCES) == 3
-    assert not set(names.TRAIN_APPEARANCES) & set(names.HELDOUT_APPEARANCES)
+    assert not set(SHOWN_IN_TRAINING) & set(names.HELDOUT_APPEARANCES)
+
+
+def test_a_state_of_an_earlier_version_names_the_same_family():
+    """A state holds a family's index, so a family keeps it."""
+    assert names.APPEARANCES[:8] == (
+        *("silicone", "mucosa", "skin", "muscle", "fat"),
+        *("liver", "bowel", "scar"),
+    )
+
+
+def test_a_varied_family_is_one_for_training_with_other_surroundings():
+    for name, varied in zip(names.TRAIN_APPEARANCES, names.VARIED_APPEARANCES, strict=True):
+        own, other = vars(FAMILIES[name]), vars(FAMILIES[varied])
+        assert {part for part in own if own[part] != other[part]} == {
+            *("drape", "tray", "tray_finish")
+        }
+
+
+def test_random_cloths_are_of_any_colour_and_no_two_alike():
+    cloths = [draw_textures(Appearance("varied_fat", seed))["drape"] for seed in range(80)]
+    means = np.array([cloth.mean(axis=(0, 1)) for cloth in cloths])
+    assert (means.min(axis=0) < 60).all() and (means.max(axis=0) > 180).all()
+    strongest = means.argmax(axis=1)  # red, green or blue
+    assert set(strongest) == {0, 1, 2}
+    assert len({cloth.tobytes() for cloth in cloths}) == len(cloths)
 
 
 def test_held_out_families_share_no_part_with_those_for_training():
     trained, held = (
         [part for name in group for part in parts(FAMILIES[name])]
-        for group in (names.TRAIN_APPEARANCES, names.HELDOUT_APPEARANCES)
+        for group in (SHOWN_IN_TRAINING, names.HELDOUT_APPEARANCES)
     )
     assert [part for part in held if part in trained and part != WHITE] == []
 
@@ -87,9 +115,11 @@ def test_families_for_training_draw_nothing_of_the_held_out(monkeypatch, source,
         table[name] = dataclasses.replace(table[name], **{f.name: broken for f in fields})
     monkeypatch.setattr(appearance, "FAMILIES", table)
     draw_textures.cache_clear()
-    for name in names.TRAIN_APPEARANCES:
+    for name in SHOWN_IN_TRAINING:
         for seed in range(3):
             seen(source, model, Appearance(name, seed))
+    for seed in range(100):
+        draw_textures(Appearance("varied_skin", seed))
     for name in names.HELDOUT_APPEARANCES:
         with pytest.raises((AssertionError, AttributeError)):
             draw_look(Appearance(name, 0))
