@@ -9,7 +9,7 @@ import pytest
 from surgicai_vision.commands.main import main
 from surgicai_vision.commands.sweep import read_experiment
 from surgicai_vision.core import names
-from surgicai_vision.core.config import RANDOMISATION_LIMITS
+from surgicai_vision.core.config import CLOCK_PERIOD, RANDOMISATION_LIMITS
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.detection.card import RELEASED, detector_folder, read_card
 from surgicai_vision.envs.feasibility import refuse_impossible
@@ -126,15 +126,15 @@ def test_encoders_meet_in_every_cell():
     encoders = {*OFFLINE_ENCODERS, "imagenet", "clip", "r3m", "dinov2", "siglip2"}
     assert cells == {(task, name): 9 for task in ("grasp", "insert") for name in encoders}
     frames = {
-        (each.variants, each.episodes, next(iter(policy.change[1:])))
+        (each.variants, each.episodes, each.frame_stride, policy.change[-1])
         for policy in built.policies
         for each in [built.recorded(policy)]
     }
     updates = {
-        variants * episodes * int(change.removeprefix("epochs="))
-        for variants, episodes, change in frames
+        variants * episodes / stride * int(change.removeprefix("epochs="))
+        for variants, episodes, stride, change in frames
     }
-    assert len(frames) == 3 and updates == {350 * 5 * 20}, "as many updates of each"
+    assert len(frames) == 6 and updates == {350 * 5 / 10 * 20}, "as many updates of each"
     assert all(run.env.randomisation.phantom_shift == 10 for run in built.runs)
 
 
@@ -159,3 +159,14 @@ def test_a_dry_run_lists_every_run(name, tmp_path, monkeypatch, capsys):
     lacks = told["not_run"] - (4 if name == "unmoved-encoders" else 0)
     assert lacks % 18 == 0, "whole encoders, whose weights are not at hand"
     assert lacks <= (5 * 18 if name == "unmoved-encoders" else 0)
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_every_moment_of_an_attempt_is_seen_in_each_attempt_of_a_search(name):
+    """Else a policy learns what to do at some moment of one attempt and does it in the next."""
+    searches = [
+        dataset.demonstrations
+        for dataset in PLANS[name].datasets.values()
+        if dataset.demonstrations.demonstrator == "search" and dataset.demonstrations.view
+    ]
+    assert all(CLOCK_PERIOD % each.frame_stride == 0 for each in searches)
