@@ -28,7 +28,7 @@ from surgicai_vision.evaluation.hierarchical_config import (
     read_hierarchical,
 )
 from surgicai_vision.evaluation.policy_spec import open_policy
-from surgicai_vision.evaluation.run import evaluate_once
+from surgicai_vision.evaluation.run import check_scene, evaluate_once
 from surgicai_vision.evaluation.storage import Row
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training import released
@@ -93,7 +93,7 @@ def sweep_ends(
 
     Raises:
         InputError: privileged ends, test starts, or values that are not allowed.
-        OutputExists: `out` holds another policy or other starts.
+        OutputExists: `out` holds another policy, other starts or another scene.
     """
     given = read_hierarchical(released.resolve(path))
     if given.termination != "learned":
@@ -111,13 +111,15 @@ def sweep_ends(
     ]
     # Without the pair's values: a later call may try other pairs in the same folder.
     policy = {**to_mapping(given), "confidence": None, "patience": None}
+    spec = open_policy(path, env=env, weights=weights)
     owner = {
         "hierarchical": policy,
         "env": dict(env or {}),
         "starts": to_mapping(starts),
-        **open_policy(path, env=env, weights=weights).content,
+        **spec.content,
     }
     files.claim(out / MARK, owner, "the ends")
+    check_scene(out, spec.config.scene, "ends")
     tried: dict[HierarchicalConfig, Ends] = {}
     for config in configs:
         name = f"confidence-{config.confidence:g}-patience-{config.patience}"

@@ -14,7 +14,7 @@ from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.rollout import check_seeds
-from surgicai_vision.evaluation.run import evaluate_into
+from surgicai_vision.evaluation.run import check_scene, evaluate_into
 from surgicai_vision.evaluation.statistics import clopper_pearson, holm, mcnemar
 from surgicai_vision.evaluation.storage import MARKER, Row, parquet_bytes, read_rows
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
@@ -64,10 +64,11 @@ def evaluate_swaps(
 
     Raises:
         InputError: seeds that `check_seeds` refuses.
-        OutputExists: `out` holds another policy or other starts.
+        OutputExists: `out` holds another policy, other starts or another scene.
     """
     check_seeds(seeds)
     _claim(out, variants[AS_IT_IS], seeds)
+    check_scene(out, variants[AS_IT_IS].config.scene, "expert swaps")
     successes: dict[str, list[bool]] = {}
     rows: list[Row] = []
     for name, spec in variants.items():

@@ -4,7 +4,8 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from surgicai_vision.core.config import digest, to_mapping
+from surgicai_vision.core.config import SceneConfig, digest, to_mapping
+from surgicai_vision.core.errors import OutputExists
 from surgicai_vision.core.progress import Progress, Stage
 from surgicai_vision.evaluation.films import Filming
 from surgicai_vision.evaluation.finished import FOLDER, FinishedEpisodes
@@ -15,11 +16,33 @@ from surgicai_vision.evaluation.storage import (
     MARKER,
     Row,
     alone_in,
+    find_evaluations,
     read_evaluation,
     write_evaluation,
 )
 from surgicai_vision.scene import build_scene
 from surgicai_vision.training.run_config import Starts
+
+
+def check_scene(out: Path, scene: SceneConfig, what: str) -> None:
+    """Refuse a folder with evaluations in another scene, which cannot be paired with new ones.
+
+    Args:
+        out: folder that holds evaluations, or is to hold some.
+        scene: of the new evaluations.
+        what: what the folder's evaluations are, for the message.
+
+    Raises:
+        OutputExists: an evaluation in `out` was made in another scene.
+    """
+    present = build_scene(scene).hash
+    for folder in find_evaluations(out):
+        made_in = read_evaluation(folder).about.get("scene_hash")
+        if made_in not in (None, present):
+            raise OutputExists(
+                f"{out} holds {what} of scene {made_in[:12]}, and the present scene is "
+                f"{present[:12]}; give another --out."
+            )
 
 
 def evaluate_once(

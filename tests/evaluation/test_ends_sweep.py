@@ -82,6 +82,17 @@ def test_a_high_level_policy_trained_anew_is_another_one(policy_file: Path, tmp_
         sweep_ends(policy_file, starts, tmp_path / "out", silent_stage, (0.5,), (1,), workers=1)
 
 
+def test_ends_of_another_scene_are_not_continued(policy_file: Path, tmp_path: Path) -> None:
+    starts = Starts(names.VALIDATION_SEED, 1)
+    sweep_ends(policy_file, starts, tmp_path / "out", silent_stage, (0.5,), (1,), workers=1)
+    marker = tmp_path / "out" / "confidence-0.5-patience-1" / MARKER
+    stored = json.loads(marker.read_text())
+    stored["about"]["scene_hash"] = "0" * 64
+    marker.write_text(json.dumps(stored))
+    with pytest.raises(OutputExists, match="ends of scene 000000000000"):
+        sweep_ends(policy_file, starts, tmp_path / "out", silent_stage, (0.5,), (1,), workers=1)
+
+
 def test_test_starts_and_privileged_ends_are_refused(policy_file: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="reach into the test starts"):
         sweep_ends(policy_file, Starts(names.TEST_SEED - 1, 2), tmp_path / "out", silent_stage)

@@ -87,6 +87,18 @@ def test_a_part_trained_anew_in_the_same_folder_is_another_policy(tmp_path):
         evaluate_swaps(variants_of(path), seeds, tmp_path / "out", silent_stage, 1)
 
 
+def test_swaps_of_another_scene_are_not_continued(policy_file, tmp_path):
+    policy_file.write_text(POLICY.replace("520", "2"))
+    seeds = [names.TEST_SEED]
+    evaluate_swaps(variants_of(policy_file), seeds, tmp_path / "out", silent_stage, 1)
+    marker = tmp_path / "out" / AS_IT_IS / MARKER
+    stored = json.loads(marker.read_text())
+    stored["about"]["scene_hash"] = "0" * 64
+    marker.write_text(json.dumps(stored))
+    with pytest.raises(OutputExists, match="expert swaps of scene 000000000000"):
+        evaluate_swaps(variants_of(policy_file), seeds, tmp_path / "out", silent_stage, 1)
+
+
 def test_one_subtask_can_be_swapped_alone(policy_file, tmp_path, capsys):
     assert (
         main(

@@ -14,13 +14,13 @@ from pathlib import Path
 
 from surgicai_vision.core import files
 from surgicai_vision.core.config import to_mapping
-from surgicai_vision.core.errors import InputError, OutputExists, check_name
+from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.robustness import CURVES, MARK, STRENGTHS
 from surgicai_vision.evaluation.robustness.axes import AXES, axes_of, shifted
 from surgicai_vision.evaluation.rollout import check_seeds
-from surgicai_vision.evaluation.run import evaluate_into
+from surgicai_vision.evaluation.run import check_scene, evaluate_into
 from surgicai_vision.evaluation.statistics import (
     area_interval,
     area_under_curve,
@@ -41,7 +41,6 @@ from surgicai_vision.evaluation.storage import (
     read_rows,
     read_versioned,
 )
-from surgicai_vision.scene import build_scene
 from surgicai_vision.training.run_config import Shift
 
 
@@ -77,7 +76,7 @@ def robustness(
     chosen = _checked(spec, axes, strengths)
     check_seeds(seeds)
     _claim(out, spec, seeds)
-    _check_scene(out, spec)
+    check_scene(out, spec.config.scene, "curves")
     places = [out / axis / f"{0.0:g}" for axis in AXES]
     plain = next((place for place in places if (place / MARKER).exists()), None)
     for axis in chosen:
@@ -133,18 +132,6 @@ def _checked(spec: PolicySpec, axes: Sequence[str], strengths: Sequence[float]) 
 
 def _list(items: Sequence[object]) -> str:
     return ", ".join(map(str, items)) or "none"
-
-
-def _check_scene(out: Path, spec: PolicySpec) -> None:
-    """Refuse a folder with evaluations in another scene, which cannot be paired with new ones."""
-    present = build_scene(spec.config.scene).hash
-    for folder in find_evaluations(out):
-        made_in = read_evaluation(folder).about.get("scene_hash")
-        if made_in not in (None, present):
-            raise OutputExists(
-                f"{out} holds curves of scene {made_in[:12]}, and the present scene is "
-                f"{present[:12]}; give another --out."
-            )
 
 
 def _claim(out: Path, spec: PolicySpec, seeds: Sequence[int]) -> None:
