@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -129,4 +131,25 @@ def check_late(demonstrator: str, disturbance: Disturbance) -> None:
             f"late is {disturbance.late}, but demonstrator '{demonstrator}' never goes back to "
             "an earlier subtask; leave late out or use demonstrator "
             f"{', '.join(RETURNING_DEMONSTRATORS)}."
+        )
+
+
+def check_returning(demonstrator: str, config: TaskConfig) -> None:
+    """Refuse a demonstrator that goes back after a loss where it cannot.
+
+    Raises:
+        InputError: a single subtask, which has nothing to go back to, or an env that does not
+            advance to the next subtask at a success.
+    """
+    if demonstrator not in RETURNING_DEMONSTRATORS:
+        return
+    if config.task != names.SUTURE:
+        raise InputError(
+            f"Demonstrator '{demonstrator}' goes back to earlier subtasks; '{config.task}' has "
+            f"none. Give task {names.SUTURE}, or demonstrator expert."
+        )
+    if config.advance != "success":
+        raise InputError(
+            f"Demonstrator '{demonstrator}' needs an env that advances at each success; advance is "
+            f"'{config.advance}'. Leave env.advance out."
         )

@@ -45,7 +45,12 @@ from surgicai_vision.demos.demonstrator import (
     BehaviourPolicy,
     make_demonstrator,
 )
-from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance, check_late
+from surgicai_vision.demos.disturbance import (
+    UNDISTURBED,
+    Disturbance,
+    check_late,
+    check_returning,
+)
 from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import (
     MARKER,
@@ -183,6 +188,7 @@ def record(
     check_training_starts(seed, episodes)
     _check_demos(demonstrator, demos, source)
     check_late(demonstrator, disturbance)
+    check_returning(demonstrator, config)
     _check_held(config, demonstrator, post_success_steps)
     if config.task == names.SUTURE and config.advance == "told" and learner is None:
         raise InputError(

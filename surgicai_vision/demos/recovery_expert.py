@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import DWELL
-from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.demonstrator import Demonstrator
+from surgicai_vision.demos.disturbance import check_returning
 from surgicai_vision.demos.expert import (
     HOVER,
     OPEN_ABOVE,
@@ -99,16 +99,9 @@ class RecoveryExpert(Demonstrator):
     """
 
     def __init__(self, env: SuturingEnv):
+        check_returning("recover", env.config)
         if not isinstance(env, Suture):
-            raise InputError(
-                f"Demonstrator 'recover' goes back to earlier subtasks; '{env.task}' has none. "
-                f"Give --task {names.SUTURE}, or demonstrator expert."
-            )
-        if env.config.advance != "success":
-            raise InputError(
-                "Demonstrator 'recover' needs an env that advances at each success; advance is "
-                f"'{env.config.advance}'. Leave env.advance out."
-            )
+            raise TypeError(f"the env of task '{env.task}' is no Suture")
         self._env = env
         self._expert = Expert(env)
         self._phase = -1

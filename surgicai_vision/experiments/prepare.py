@@ -14,7 +14,7 @@ from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset.layouts import SURGICAI
 from surgicai_vision.dataset.render import check_request, render_demos
 from surgicai_vision.demos.cut import cut_demos
-from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance
+from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance, check_returning
 from surgicai_vision.demos.record import Learner, record
 from surgicai_vision.demos.store import list_demos
 from surgicai_vision.envs.upset import check_upset_task
@@ -25,10 +25,12 @@ def check_dataset(dataset: DatasetConfig) -> None:
     """Refuse what cannot be recorded or rendered, before any work.
 
     Raises:
-        InputError: upsets in a task that has none; a size or frame stride that is not allowed.
+        InputError: upsets in a task that has none; a demonstrator that goes back where it cannot;
+            a size or frame stride that is not allowed.
         UnknownName: a view that does not exist.
     """
     recorded = dataset.demonstrations
+    check_returning(recorded.demonstrator, dataset.env)
     if recorded.view:
         check_request(recorded.view, dataset.size, recorded.frame_stride, None, SURGICAI)
     if recorded.upset_fraction:

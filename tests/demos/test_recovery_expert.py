@@ -104,9 +104,16 @@ def test_it_gives_up_where_no_way_leads_on(monkeypatch):
     assert steps < SUTURE.max_steps / 2 and "grasp" in recover.gives_up
 
 
-def test_it_needs_the_whole_procedure():
-    with pytest.raises(InputError, match="Give --task suture"):
+def test_it_needs_the_whole_procedure(tmp_path):
+    with pytest.raises(InputError, match="Give task suture"):
         make_demonstrator("recover", envs.make(TaskConfig("grasp")))
+    for config, wanted in (
+        (TaskConfig("grasp"), "Give task suture"),
+        (TaskConfig("suture", advance="told"), "Leave env.advance out"),
+    ):
+        with pytest.raises(InputError, match=wanted):
+            record(config, episodes=1, out=tmp_path / "demos", demonstrator="recover")
+        assert not list(tmp_path.iterdir())  # refused before any work
 
 
 def test_recordings_say_what_went_wrong_and_repeat_themselves(tmp_path):

@@ -377,6 +377,16 @@ def test_a_wrong_plan_is_refused(changed, told):
         plan_of({**TABLE, **changed}, "a test")
 
 
+def test_a_demonstrator_that_cannot_go_back_is_refused_before_any_work(tiny, tmp_path):
+    demonstrations = tuple(
+        each if each.task == "suture" else replace(each, demonstrator="recover", visits_of="")
+        for each in tiny.demonstrations
+    )
+    with pytest.raises(InputError, match="has none. Give task suture"):
+        sweep(replace(tiny, demonstrations=demonstrations), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_misspelt_recipe_is_refused_before_any_work(tiny, tmp_path):
     policies = (replace(tiny.policies[0], recipe="bets"), *tiny.policies[1:])
     with pytest.raises(InputError, match="Did you mean 'best'"):
