@@ -13,7 +13,7 @@ import dataclasses
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from surgicai_vision.core import files, names
 from surgicai_vision.core.cameras import check_camera
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.core.video import SUFFIX, write_video
 from surgicai_vision.evaluation.metrics import EpisodeMetrics
 
@@ -112,25 +113,32 @@ class Filming:
 
         Raises:
             OutputExists: the folder holds other files.
+            BadFile: its list of videos is damaged.
         """
         files.check_output(self.folder, may_resume=INDEX, option="--video")
         self.folder.mkdir(parents=True, exist_ok=True)
         if (self.folder / INDEX).exists():
-            for row in self._listed():
-                if row["seed"] not in kept:
-                    (self.folder / Path(row["file"]).name).unlink(missing_ok=True)
+            for name, seed in self._listed():
+                if seed not in kept:
+                    (self.folder / name).unlink(missing_ok=True)
         files.write_json(self.folder / INDEX, {"videos": []})
         count = int(self.of) if self.of.isdecimal() else 0
         return dataclasses.replace(self, first=tuple(int(seed) for seed in seeds[:count]))
 
     def videos(self) -> list[str]:
         """Return the names of the videos in the folder's list."""
-        return [Path(row["file"]).name for row in self._listed()]
+        return [name for name, _ in self._listed()]
 
-    def _listed(self) -> list[dict[str, Any]]:
-        """Return the rows of the folder's list."""
-        rows: list[dict[str, Any]] = files.read_json(self.folder / INDEX)["videos"]
-        return rows
+    def _listed(self) -> list[tuple[str, int]]:
+        """Return name and start of each video in the folder's list."""
+        where = str(self.folder / INDEX)
+        table = checked(files.read_json(self.folder / INDEX), dict, where)
+        listed = []
+        for row in checked(table.get("videos"), list, f"{where}: videos"):
+            video = checked(row, dict, f"{where}: a video")
+            name = checked(video.get("file"), str, f"{where}: a video's file")
+            listed.append((Path(name).name, checked(video.get("seed"), int, f"{where}: {name}")))
+        return listed
 
     def wants(self, row: EpisodeMetrics) -> bool:
         """Return True if an episode is to become a video."""

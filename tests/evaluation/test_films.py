@@ -8,7 +8,7 @@ import pytest
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import InputError, OutputExists
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists
 from surgicai_vision.core.video import read_video
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.agents import ExpertAgent, ZeroAgent
@@ -89,6 +89,23 @@ def test_a_video_that_another_policy_left_is_not_listed(tmp_path):
     filming = Filming(tmp_path, "successes", SMALL)
     evaluate(ZeroAgent, config, [900], workers=1, filming=filming)
     assert names_in(tmp_path) == [left] and filming.videos() == []
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ('{"videos": [', "is not valid JSON"),
+        ("[]", "it must be a table of keys"),
+        ("{}", "videos is None; it must be a list"),
+        ('{"videos": [{"file": 3, "seed": 1}]}', "a video's file is 3; it must be text"),
+        ('{"videos": [{"file": "a.mp4", "seed": "1"}]}', "a.mp4 is .1.; it must be a whole number"),
+    ],
+)
+def test_a_damaged_list_of_videos_is_refused_before_any_episode(content, told, tmp_path):
+    (tmp_path / "videos.json").write_text(content)
+    with pytest.raises(BadFile, match=told):
+        evaluate(ZeroAgent, SHORT, [1], workers=1, filming=Filming(tmp_path, look=SMALL))
+    assert [path.name for path in tmp_path.iterdir()] == ["videos.json"]
 
 
 def test_rows_and_videos_depend_on_neither_filming_nor_workers(tmp_path):
