@@ -169,6 +169,11 @@ def _demos(options: Options) -> list[Path]:
     from surgicai_vision.demos.store import first_demos
 
     if options.from_ is None:
+        if options.demos_used is not None:
+            raise InputError(
+                f"--demos-used is {options.demos_used}, but there is no --from whose "
+                "demonstrations it counts; give --from DEMOS, or leave --demos-used out."
+            )
         return []
     chooses = options.demonstrator in CHOOSING_DEMONSTRATORS
     return first_demos(options.from_, options.demos_used or (None if chooses else 1))

@@ -12,12 +12,15 @@ error is written to `meta/surgicai.json`.
 import dataclasses
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import pyarrow as pa
+
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import BadFile, InputError, OutputExists, check_name
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists, check_name, first_line
 from surgicai_vision.core.executor import RunContext, building, work_folder
 from surgicai_vision.core.files import check_output, read_json, whole_folder, write_json
 from surgicai_vision.core.progress import Progress
@@ -79,6 +82,7 @@ def convert_dataset(
         UnknownName: a view that the dataset does not have, or an unknown codec.
         InputError: videos were requested from a dataset of videos, or from images whose size the
             codec does not support.
+        BadFile: `path` is not a dataset of ours, or a damaged one.
         OutputExists: `out` holds something else.
     """
     started = time.monotonic()
@@ -182,7 +186,8 @@ def write_converted(
         )
     shown = schema.image_keys(views, dataset.has_depth, dataset.has_segmentation)
     keys = [key for key, _, _ in shown]
-    features = _features(files, dataset, views, keys, video)
+    with _refused_if_damaged(dataset.path):
+        features = _features(files, dataset, views, keys, video)
     with whole_folder(out) as folder:
         # Each episode's place in the videos, by feature; empty without videos.
         encoded: list[dict[str, Encoded]] = []
@@ -190,10 +195,13 @@ def write_converted(
             encoded = encode_views(dataset, folder, views, video, store, context, progress)
             places = [{key: item.place for key, item in episode.items()} for episode in encoded]
         else:
-            places = _copy_videos(files, folder, [key for key in keys if key in dataset.video_keys])
-        rows = _write_data(files, folder, features, places)
-        _check_complete(files, rows, dataset)
-        write_metadata(folder, features, list(files.tasks.values()), rows, files.info)
+            with _refused_if_damaged(dataset.path):
+                copied = [key for key in keys if key in dataset.video_keys]
+                places = _copy_videos(files, folder, copied)
+        with _refused_if_damaged(dataset.path):
+            rows = _write_data(files, folder, features, places)
+            _check_complete(files, rows, dataset)
+            write_metadata(folder, features, list(files.tasks.values()), rows, files.info)
         meta = {
             **dataset.meta,
             "views": list(views),
@@ -204,6 +212,18 @@ def write_converted(
             **changes,
         }
         write_json(folder / names.META_FILE, meta)
+
+
+@contextmanager
+def _refused_if_damaged(path: Path) -> Iterator[None]:
+    """Refuse a dataset whose files hold other types than LeRobot's, or fewer rows or columns."""
+    try:
+        yield
+    except (pa.ArrowException, LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise BadFile(
+            f"{path} is damaged ({first_line(error)}); repair it first with 'lerobot-salvage "
+            "repair'."
+        ) from None
 
 
 def _features(

@@ -8,11 +8,14 @@
     dataset.extrinsics("front_psm2")        # (N, 4, 4) T_world_camera
 
 Frames are numbered over the whole dataset, like LeRobot's `index` column. The encoded images of the
-last few row groups (one episode of one column each) are kept in memory.
+last few row groups (one episode of one column each) are kept in memory. Several threads may read
+one dataset.
 """
 
 import functools
 import hashlib
+import itertools
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -44,6 +47,8 @@ from surgicai_vision.dataset.video import read_frames
 DAMAGED = (AttributeError, KeyError, TypeError, ValueError, OverflowError, InputError)
 """Errors raised by a value of the wrong type, or out of its range, in the metadata."""
 DECODERS = 4  # threads that decode images: one core decodes about 400 of 224 × 224 a second
+MOST_DECODED = 32
+"""Most decoded images that wait for a reader: an episode of large ones would fill the memory."""
 VIDEO_PLACE = ("chunk_index", "file_index", "from_timestamp")
 
 
@@ -113,6 +118,7 @@ class RenderedDataset:
             raise BadFile(f"{file} is damaged ({error}).") from None
         self._paths = sorted(self.path.glob("data/chunk-*/file-*.parquet"))
         self._files = [_open(path) for path in self._paths]
+        self._lock = threading.RLock()  # a parquet file read by two threads ends the process
         self._cache: dict[tuple[str, int], list[pa.Buffer]] = {}
         self._groups: list[_RowGroup] = []
         start = 0
@@ -217,7 +223,8 @@ class RenderedDataset:
                 if low < high:
                     content = self._content(key, position)[low - group.start : high - group.start]
                     where = [f"{self.path}: {key}, frame {index}" for index in range(low, high)]
-                    yield from decoders.map(codecs.decode, content, where)
+                    for some in itertools.batched(zip(content, where, strict=True), MOST_DECODED):
+                        yield from decoders.map(codecs.decode, *zip(*some, strict=True))
 
     def _from_videos(
         self, key: str, start: int, stop: int
@@ -248,6 +255,12 @@ class RenderedDataset:
                 raise BadFile(
                     f"{file} does not say where the videos are ({first_line(error)})."
                 ) from None
+        shown = [(row["dataset_from_index"], row["dataset_to_index"]) for row in rows]
+        if shown != self.bounds():
+            raise BadFile(
+                f"{self.path}: the rows of meta/episodes are not those of the episodes in the "
+                "data; repair it first with 'lerobot-salvage repair'."
+            )
         return rows
 
     def _view(self, view: str) -> str:
@@ -302,14 +315,18 @@ class RenderedDataset:
 
     def _content(self, key: str, position: int) -> list[pa.Buffer]:
         """Return the encoded images of one row group; the last few are kept."""
-        if (key, position) not in self._cache:
-            while len(self._cache) >= 2 * max(1, len(self.views)):
-                self._cache.pop(next(iter(self._cache)))
-            group = self._groups[position]
-            column = self._read(group.file, group.number, f"{key}.bytes", key).combine_chunks()
-            content = [item.as_buffer() for item in pc.struct_field(column, "bytes")]
-            self._cache[key, position] = content
-        return self._cache[key, position]
+        with self._lock:
+            if (key, position) not in self._cache:
+                while len(self._cache) >= 2 * max(1, len(self.views)):
+                    self._cache.pop(next(iter(self._cache)))
+                group = self._groups[position]
+                column = self._read(group.file, group.number, f"{key}.bytes", key).combine_chunks()
+                images = pc.struct_field(column, "bytes")
+                if not (pa.types.is_binary(images.type) or pa.types.is_large_binary(images.type)):
+                    raise BadFile(f"{self.path}: column {key} holds {images.type}, not images.")
+                content = [item.as_buffer() for item in images]
+                self._cache[key, position] = content
+            return self._cache[key, position]
 
     def _read(
         self, file: int, group: int | None, column: str, key: str | None = None
@@ -318,7 +335,10 @@ class RenderedDataset:
         reader = self._files[file]
         try:
             columns = [column]
-            table = reader.read(columns) if group is None else reader.read_row_group(group, columns)
+            with self._lock:
+                table = (
+                    reader.read(columns) if group is None else reader.read_row_group(group, columns)
+                )
             return table.column(key or column)
         except (OSError, KeyError, pa.ArrowException) as error:
             raise BadFile(

@@ -173,6 +173,57 @@ def test_a_place_far_beyond_a_video_is_a_bad_file(tmp_path, demos):
     assert not check_dataset(tmp_path / "video").ok
 
 
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda table: table.slice(0, 2),
+        lambda table: pa.concat_tables([table, table]),
+        lambda table: moved(table, "dataset_from_index", -1),
+        lambda table: moved(table, "dataset_from_index", 1),
+    ],
+    ids=["lost", "doubled", "overlap", "gap"],
+)
+def test_videos_of_other_episodes_than_the_data_has_are_refused(tmp_path, demos, spoil):
+    render(demos, tmp_path / "video", video="h264")
+    file = tmp_path / "video/meta/episodes/chunk-000/file-000.parquet"
+    pq.write_table(spoil(pq.read_table(file)), file)
+    with pytest.raises(BadFile, match="are not those of the episodes in the data"):
+        open_dataset(tmp_path / "video").frames("front")
+    assert not check_dataset(tmp_path / "video").ok
+
+
+@pytest.mark.parametrize(
+    ("video", "column", "values"),
+    [
+        ("h264", f"videos/{names.image_key('front')}/chunk_index", None),
+        ("h264", f"videos/{names.image_key('front')}/chunk_index", ["a"] * 3),
+        (None, f"stats/{names.STATE}/std", [0.5] * 3),
+        (None, f"stats/{names.STATE}/mean", None),
+    ],
+)
+def test_damaged_rows_of_episodes_are_refused(tmp_path, demos, video, column, values):
+    render(demos, tmp_path / "set", video=video)
+    file = tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(file)
+    place = table.column_names.index(column)
+    spoilt = (
+        table.remove_column(place)
+        if values is None
+        else table.set_column(place, column, pa.array(values))
+    )
+    pq.write_table(spoilt, file)
+    with pytest.raises(BadFile, match=r"is damaged .*; repair it first"):
+        convert_dataset(tmp_path / "set", tmp_path / "front", views=("front",))
+    assert not (tmp_path / "front").exists()
+
+
+def moved(table, column, by):
+    """Return a table of episodes with a number of its second one changed."""
+    values = table.column(column).to_pylist()
+    values[1] += by
+    return table.set_column(table.column_names.index(column), column, pa.array(values))
+
+
 def test_the_same_command_again_does_nothing_and_wrong_ones_are_refused(tmp_path, demos):
     render(demos, tmp_path / "set")
     first = convert_dataset(tmp_path / "set", tmp_path / "back", views=("back",))

@@ -3,11 +3,14 @@
 import dataclasses
 import json
 import math
+import os
 import re
 import struct
 import subprocess
 import sys
+import threading
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -31,6 +34,7 @@ from surgicai_vision.dataset import (
     codecs,
     metadata,
     open_dataset,
+    reader,
     render_demos,
     render_jobs,
     schema,
@@ -175,6 +179,80 @@ def test_frames_across_episodes_equal_single_frames(tmp_path, fake, demos):
         dataset.frames("back", 0, dataset.length + 1)
     with pytest.raises(UnknownName, match="view of this dataset"):
         dataset.frames("wrist_psm1", 0, 1)
+
+
+class OneThread:
+    """A parquet file that no second thread may read meanwhile, as pyarrow's must not be."""
+
+    def __init__(self, file):
+        self.file = file
+        self.free = threading.Lock()
+
+    def read_row_group(self, *arguments):
+        assert self.free.acquire(blocking=False)
+        try:
+            os.sched_yield()
+            return self.file.read_row_group(*arguments)
+        finally:
+            self.free.release()
+
+
+def test_several_threads_read_one_dataset(tmp_path, fake, demos):
+    render(demos, tmp_path / "set")
+    whole = open_dataset(tmp_path / "set")
+    frames = {view: whole.frames(view) for view in whole.policy_views}
+    dataset = open_dataset(tmp_path / "set")
+    dataset._files = [OneThread(file) for file in dataset._files]
+    wanted = [(view, at) for at, _ in whole.bounds() for view in frames] * 20
+
+    def same(view, at):
+        return np.array_equal(dataset.frames(view, at, at + 1)[0], frames[view][at])
+
+    with ThreadPoolExecutor(4) as readers:
+        assert all(readers.map(same, *zip(*wanted, strict=True)))
+
+
+def test_few_decoded_images_wait_for_their_reader(tmp_path, fake, demos, monkeypatch):
+    render(demos, tmp_path / "set")
+    dataset = open_dataset(tmp_path / "set")
+    decoded = []
+
+    class AtOnce:
+        """Threads that have decoded everything they were given when a reader asks."""
+
+        def __init__(self, threads):
+            assert threads == reader.DECODERS
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            decoded.append("closed")
+
+        def map(self, decode, contents, places):
+            decoded.extend(places)
+            return map(decode, contents, places)
+
+    monkeypatch.setattr(reader, "ThreadPoolExecutor", AtOnce)
+    monkeypatch.setattr(reader, "MOST_DECODED", 2)
+    first, last = max(dataset.bounds(), key=lambda bounds: bounds[1] - bounds[0])
+    assert last - first > 4
+    images = dataset.decoded(names.image_key("front"), first, last)
+    for seen in range(1, last - first + 1):
+        next(images)
+        assert seen <= len(decoded) <= seen + 1
+    images.close()
+    assert decoded[-1] == "closed"
+
+
+def test_an_image_column_of_numbers_is_refused(tmp_path, fake, demos):
+    render(demos, tmp_path / "set")
+    data = tmp_path / "set/data/chunk-000/file-000.parquet"
+    numbers = pa.array([{"bytes": 5, "path": "x"}] * len(pq.read_table(data)))
+    place = pq.read_schema(data).get_field_index(FRONT)
+    rewrite(data, lambda table: table.set_column(place, FRONT, numbers))
+    with pytest.raises(BadFile, match=f"{FRONT} holds int64, not images"):
+        open_dataset(tmp_path / "set").frames("front")
 
 
 def test_digest_is_that_of_the_decoded_content(tmp_path, fake, demos):

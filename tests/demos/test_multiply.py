@@ -264,3 +264,10 @@ def test_needle_and_grasp_go_with_the_object(sources):
     one = poses.flat(np.linalg.inv(source.start.needle) @ way.reposed(source.start)[0])
     other = poses.flat(np.linalg.inv(there.needle) @ way.reposed(there)[0])
     np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_a_number_of_demonstrations_without_their_folder_is_refused(tmp_path):
+    options = record_demos.Options(demos_used=7, out=tmp_path / "demos")
+    with pytest.raises(InputError, match="--demos-used is 7, but there is no --from"):
+        record_demos.run(options, console=Console())
+    assert not (tmp_path / "demos").exists()
