@@ -29,8 +29,10 @@ from surgicai_vision.commands.options import (
     task_config,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig, read_changes
-from surgicai_vision.core.errors import InputError, check_at_most
+from surgicai_vision.core.config import TaskConfig, read_changes, to_mapping
+from surgicai_vision.core.errors import InputError, OutputExists, check_at_most
+from surgicai_vision.core.files import read_json
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.features import encoders
 from surgicai_vision.features.devices import find_device
@@ -43,6 +45,7 @@ from surgicai_vision.training.run_config import RunConfig, with_budget
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset import Dataset
+    from surgicai_vision.rl.settings import Request
 
 app = App(
     name="train",
@@ -380,7 +383,8 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
         task = folders.demos_task(folder)
         folders.check_task(options.task, task, folder)
     elif options.demos or options.demonstrations:
-        raise InputError(f"--algo {algo} does not learn from demonstrations; leave --demos out.")
+        given = "--demos" if options.demos else "--demonstrations"
+        raise InputError(f"--algo {algo} does not learn from demonstrations; leave {given} out.")
     config = task_config(task, options.env)
     requests = [
         Request(
@@ -401,7 +405,8 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
     ]
     from surgicai_vision.rl.train import run_of, train_seeds
 
-    outs = _checked_folders(options, [run_of(request) for request in requests])
+    outs = _checked_folders(options, requests, [run_of(request) for request in requests])
+    notes: list[str] = []
     unit = "control steps" if algorithm.is_online else "updates"
     with console.stage(f"policy: {run_of(requests[0]).name}", unit) as progress:
         train_seeds(
@@ -410,15 +415,22 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
             outs,
             workers=options.workers,
             progress=progress,
+            note=notes.append,
             tensorboard=options.log in ("auto", "tensorboard"),
         )
+    for text in dict.fromkeys(notes):  # every seed has the same
+        console.note(f"warning: {text}")
     for out in outs:
         console.say(f"checkpoint: {out}")
     console.say(f"next: surgicai-vision evaluate {outs[0]}")
     return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}
 
 
-def _checked_folders(options: Options, runs: Sequence[RunConfig]) -> list[Path]:
+def _checked_folders(
+    options: Options,
+    requests: Sequence["Request | HighLevelRequest | ResidualRequest"],
+    runs: Sequence[RunConfig],
+) -> list[Path]:
     """Return the runs' checkpoint folders; refuse unusable ones before any work.
 
     Raises:
@@ -429,8 +441,14 @@ def _checked_folders(options: Options, runs: Sequence[RunConfig]) -> list[Path]:
 
     check_at_most(LARGEST_SEED, seed=max(run.seed for run in runs))
     outs = [options.out or folders.train_folder(run.task, run.name, run.seed) for run in runs]
-    for out in outs:
+    for request, out in zip(requests, outs, strict=True):
         folders.check_folder(out, REQUEST, ours=(LOCK,))
+        if (out / REQUEST).exists():
+            recorded = checked(read_json(out / REQUEST), dict, str(out / REQUEST))
+            if recorded.get("request") != to_mapping(request):
+                raise OutputExists(
+                    f"{out} holds another training; remove it, or give another --seed or --out."
+                )
     return outs
 
 
@@ -459,7 +477,7 @@ def _high_level(options: Options, low: Path, console: Console) -> dict[str, obje
 
     weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     runs = [run_of(request, TaskConfig(names.SUTURE)) for request in requests]
-    outs = _checked_folders(options, runs)
+    outs = _checked_folders(options, requests, runs)
     for request, run, out in zip(requests, runs, outs, strict=True):
         with console.stage(f"high-level policy: {run.name}", "decisions") as progress:
             train_high_level(request, out, weights=weights, progress=progress)
@@ -493,7 +511,7 @@ def _residual(options: Options, base: Path, console: Console) -> dict[str, objec
     weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     corrected = base_of(requests[0], weights).run
     runs = [run_of(request, corrected) for request in requests]
-    outs = _checked_folders(options, runs)
+    outs = _checked_folders(options, requests, runs)
     for request, run, out in zip(requests, runs, outs, strict=True):
         with console.stage(f"policy: {run.name}", "control steps") as progress:
             train_residual(request, out, weights=weights, progress=progress)

@@ -18,14 +18,15 @@ D3RLPY = "d3rlpy"
 
 SUCCESS = ("success_steps", "tolerance_share", "keeps_holes")
 """What a success requires in learning beyond the paper's rule (`core.config.SuccessRule`)."""
-COMMON = ("hidden", "learning_rate", "gamma", "batch_size", "stop_at", *SUCCESS)
-ONLINE = (*COMMON, "envs")
+COMMON = ("hidden", "learning_rate", "batch_size", "stop_at", *SUCCESS)
+VALUED = (*COMMON, "gamma")
+ONLINE = (*VALUED, "envs")
 OFF_POLICY = (*ONLINE, "tau", "train_every", "updates", "learning_starts", "critics")
 DETERMINISTIC = (*OFF_POLICY, "exploration_noise")
 TWIN_DELAYED = (*DETERMINISTIC, "policy_delay", "target_noise", "target_noise_clip")
 HINDSIGHT = ("goals", "relabel_demand")
 CLONING = ("demo_share", "bc_weight", "q_filter", "normalise_q", "clip_q")
-OFFLINE_CRITICS = (*COMMON, "tau", "critics")
+OFFLINE_CRITICS = (*VALUED, "tau", "critics")
 OFFLINE_SAMPLES = (*OFFLINE_CRITICS, "samples")
 CLONED: Mapping[str, JSON] = {"tau": 0.01, "learning_rate": 3e-4}
 """Defaults with a cloning loss: at 1e-3 the policy unlearns again (docs/results/rl.md)."""

@@ -266,12 +266,17 @@ def fill(buffer: "BaseBuffer", transitions: Transitions) -> None:
         transitions: transitions whose observations fit the buffer's space.
 
     Raises:
-        InputError: a buffer of several envs.
+        InputError: a buffer of several envs, or one that holds fewer transitions.
     """
     if buffer.n_envs != 1:
         raise InputError(
             f"The buffer is for {buffer.n_envs} parallel envs, but demonstrations are one "
             "sequence; give a model with one env."
+        )
+    if buffer.buffer_size < len(transitions):
+        raise InputError(
+            f"The buffer holds {buffer.buffer_size} transitions, and there are "
+            f"{len(transitions)}; give a model with a larger buffer_size."
         )
     last = ends(transitions)
     for row in range(len(transitions)):

@@ -19,6 +19,10 @@ State = dict[str, Any]
 """Names → tensors, numbers, texts, or tables of them."""
 
 
+class Diverged(Exception):
+    """The actor's actions are not finite."""
+
+
 class Learner(abc.ABC):
     """One running algorithm.
 
@@ -44,7 +48,11 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def advance(self, target: int) -> dict[str, float]:
-        """Learn until `done` is `target` or slightly more; return the last losses by name."""
+        """Learn until `done` is `target` or slightly more; return the last losses by name.
+
+        Raises:
+            Diverged: the actor's actions are not finite.
+        """
 
     @abc.abstractmethod
     def fill(self, policy: Policy) -> None:

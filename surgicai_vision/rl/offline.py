@@ -47,7 +47,6 @@ def _bc(settings: Settings) -> Any:
     return BCConfig(
         learning_rate=settings.learning_rate,
         batch_size=settings.batch_size,
-        gamma=settings.gamma,
         encoder_factory=VectorEncoderFactory(list(settings.hidden)),
     ).create()
 

@@ -1,9 +1,7 @@
 """Online learning with Stable-Baselines3: models from a request, and their complete state."""
 
-import io
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast, final
 
@@ -21,10 +19,12 @@ from torch import nn
 
 from policies.actor import Actor
 from policies.base import Policy
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.rl.buffers import HindsightBuffer, MixedBuffer, demonstrations_of
 from surgicai_vision.rl.extractor import FeatureMemo, RelativeExtractor, StandardExtractor
 from surgicai_vision.rl.learner import (
     Arrays,
+    Diverged,
     Learner,
     State,
     linear,
@@ -41,8 +41,6 @@ KINDS: Mapping[str, type[BaseAlgorithm]] = MappingProxyType(
     {"PPO": PPO, "DDPG": DDPG, "SAC": SAC, "TD3": TD3, "TQC": TQC}
 )
 """`Algorithm.kind` → the library's class."""
-FIRST_RANDOM_STEPS = 1000
-"""Random steps before the first update of an algorithm without demonstrations."""
 BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 EPISODES = ("ep_start", "ep_length")
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
@@ -137,7 +135,7 @@ class OnlineLearner(Learner):
             "buffer_size": request.env_steps + settings.envs,
             "train_freq": settings.train_every,
             "gradient_steps": settings.updates * settings.envs,
-            "learning_starts": self._learning_starts(),
+            "learning_starts": request.random_steps,
             "replay_buffer_class": MixedBuffer,
         }
         if request.algorithm.has_hindsight:
@@ -161,15 +159,6 @@ class OnlineLearner(Learner):
             options["target_policy_noise"] = settings.target_noise
             options["target_noise_clip"] = settings.target_noise_clip
         return options
-
-    def _learning_starts(self) -> int:
-        """Return the number of random steps at first."""
-        request = self.request
-        if request.settings.learning_starts:
-            return request.settings.learning_starts
-        if request.algorithm.needs_demos:
-            return request.episode
-        return max(request.episode, FIRST_RANDOM_STEPS)
 
     @property
     def _buffer(self) -> MixedBuffer | HindsightBuffer | None:
@@ -196,9 +185,14 @@ class OnlineLearner(Learner):
     def advance(self, target: int) -> dict[str, float]:
         """Learn until `target` control steps are done."""
         decisions = -(-target // self.request.env.action_repeat)
-        self.model.learn(
-            decisions - self.model.num_timesteps, reset_num_timesteps=False, log_interval=4
-        )
+        try:
+            self.model.learn(
+                decisions - self.model.num_timesteps, reset_num_timesteps=False, log_interval=4
+            )
+        except InputError as error:  # an env refuses such actions
+            if np.isfinite(self.env.actions).all():
+                raise
+            raise Diverged from error
         successes = self.model.ep_success_buffer
         return {"training success": float(np.mean(successes))} if successes else {}
 
@@ -274,12 +268,6 @@ class OnlineLearner(Learner):
         self.env.set_state(snapshots, state["returns"].numpy(), state["lengths"].numpy())
         model.action_space.np_random.bit_generator.state = json.loads(state["actions"])
         set_random_state(state["random"])
-
-    def save(self, path: Path) -> None:
-        """Write the model as Stable-Baselines3 does, for use with that library."""
-        content = io.BytesIO()
-        self.model.save(content)
-        path.write_bytes(content.getvalue())
 
     def close(self) -> None:
         """End the workers."""

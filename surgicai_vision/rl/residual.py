@@ -94,7 +94,13 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
         return self._sight(seen), {}
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Take one step with the frozen policy's action plus its correction, (7,) in [-1, 1]."""
+        """Take one step with the frozen policy's action plus its correction, (7,) in [-1, 1].
+
+        Raises:
+            InputError: the correction is not finite.
+        """
+        if not np.isfinite(action).all():
+            raise _diverged("its actions are")
         moved = np.clip(self._base + self._policy.bound * np.asarray(action), -1.0, 1.0)
         try:
             step = self._env.step(moved.astype(np.float32))
@@ -380,9 +386,7 @@ class _Training:
     def _write(self, weights: Weights, kept: Point, out: Path) -> Checkpoint:
         """Write the policy with these weights, which are those of the point kept."""
         if not all(torch.isfinite(weight).all() for weight in weights.values()):
-            raise InputError(
-                "The correction diverged: weights are not finite; lower the learning rate."
-            )
+            raise _diverged("its weights are")
         checkpoint = dataclasses.replace(
             self.base,
             run=run_of(self.request, self.base.run, self.env_steps),
@@ -399,6 +403,11 @@ class _Training:
     def close(self) -> None:
         """Free the simulator."""
         self.env.close()
+
+
+def _diverged(what: str) -> InputError:
+    """Return the error for a correction that diverged."""
+    return InputError(f"The correction diverged: {what} not finite; lower the learning rate.")
 
 
 def _corrected(spec: PolicySpec, policy: Residual) -> PolicyAgent:

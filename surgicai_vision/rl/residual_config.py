@@ -91,3 +91,16 @@ class ResidualRequest:
             is_read = name in CORRECTION.settings
             if not is_read and getattr(self.settings, name) != getattr(Settings, name):
                 raise InputError(f"A residual policy reads no {name}; leave it out.")
+        if self._most_updates <= self.settings.actor_starts:
+            raise InputError(
+                f"env_steps is {self.env_steps}, so there are at most {self._most_updates} "
+                f"updates, but the actor learns only after {self.settings.actor_starts}; give "
+                "more, or a lower learning_starts or actor_starts."
+            )
+
+    @property
+    def _most_updates(self) -> int:
+        """Updates of the critics if each action is one control step; fewer if it is held."""
+        settings = self.settings
+        learned = max(0, self.env_steps - settings.learning_starts)
+        return -(-learned // settings.train_every) * settings.updates

@@ -23,6 +23,8 @@ LARGEST_SEED = 2**32 - 1
 """Largest seed of Stable-Baselines3 and d3rlpy, as of NumPy's legacy generator."""
 LEAST_BATCH = 2
 """Smallest batch or rollout: PPO standardises over one, and a policy's recipe records no less."""
+FIRST_RANDOM_STEPS = 1000
+"""Random steps before the first update of an algorithm without demonstrations."""
 STOP_AFTER = 2
 """Evaluations in a row that must reach `Settings.stop_at`."""
 
@@ -207,13 +209,17 @@ class Request:
             )
         if algorithm.has_hindsight and self.env.reward != "sparse":
             raise InputError(f"'{self.algo}' needs the sparse reward, not '{self.env.reward}'.")
+        if self.env.task == names.SUTURE and self.settings.success_rule != SuccessRule():
+            raise InputError(
+                "success_steps, tolerance_share and keeps_holes are for one subtask; "
+                f"'{names.SUTURE}' has its own rule of when a subtask is over. Leave them out."
+            )
         self._check_batches()
         if self.save_every < 1 or self.validation < 0 or self.seed < 0:
             raise InputError(
                 f"save_every is {self.save_every}, validation {self.validation}, seed "
                 f"{self.seed}; they must be at least 1, 0 and 0."
             )
-
         if self.settings.stop_at and not self.validation:
             raise InputError("stop_at refers to validation starts; give validation of at least 1.")
 
@@ -225,6 +231,12 @@ class Request:
             raise InputError(
                 f"learning_starts is {settings.learning_starts}; hindsight needs whole episodes "
                 f"before the first update. Give at least {self.episode}, or 0."
+            )
+        before = self.random_steps * self.env.action_repeat
+        if "learning_starts" in algorithm.settings and self.env_steps <= before:
+            raise InputError(
+                f"env_steps is {self.env_steps}, but the first {before} have random actions and "
+                "nothing is learned in them; give more, or a lower learning_starts."
             )
         if "rollout" in algorithm.settings:
             check_at_least(LEAST_BATCH, rollout=settings.rollout)
@@ -250,6 +262,15 @@ class Request:
     def episode(self) -> int:
         """Env steps, over all envs, within which each env has finished an episode."""
         return (self.env.max_steps // self.env.action_repeat + 1) * self.settings.envs
+
+    @property
+    def random_steps(self) -> int:
+        """Env steps with random actions before the first update, over all envs."""
+        if self.settings.learning_starts:
+            return self.settings.learning_starts
+        if self.algorithm.needs_demos:
+            return self.episode
+        return max(self.episode, FIRST_RANDOM_STEPS)
 
     @property
     def keeps_demand(self) -> bool:

@@ -30,15 +30,16 @@ from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.core.words import plural
 from surgicai_vision.envs.relative import relative_features
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.rollout import run_share
 from surgicai_vision.rl.extra import check_extra
-from surgicai_vision.rl.learner import Learner
+from surgicai_vision.rl.learner import Diverged, Learner
 from surgicai_vision.rl.settings import STOP_AFTER, Request, read_by
 from surgicai_vision.rl.transitions import Transitions, of_demos
 from surgicai_vision.scene.kinematics import base_in_world
-from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
+from surgicai_vision.training.checkpoint import CARD, Checkpoint, write_checkpoint
 from surgicai_vision.training.folder import read_state, training_in, write_state
 from surgicai_vision.training.policies import policy_plugin
 from surgicai_vision.training.run_config import RunConfig
@@ -60,6 +61,12 @@ NOT_A_DISTRIBUTION = "Expected parameter "
 """How torch's error begins for a distribution with a mean of NaN or a deviation of 0."""
 Weights = Mapping[str, torch.Tensor]
 """Names → parameters of an actor."""
+Note = Callable[[str], None]
+"""Tells the user something in one line."""
+
+
+def untold(text: str) -> None:
+    """Drop a note."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +98,7 @@ def train(
     *,
     workers: int = 0,
     progress: Progress | None = None,
+    note: Note = untold,
     tensorboard: bool = True,
 ) -> Checkpoint:
     """Train, or resume an interrupted training, and write the checkpoint.
@@ -101,18 +109,23 @@ def train(
         out: the checkpoint folder; new, or one of the same request.
         workers: worker processes that step the envs; they change no result.
         progress: called with (control steps or updates done, in total).
+        note: called with a line on demonstrations that are left out.
         tensorboard: write curves to `<out>-tensorboard`.
 
     Raises:
-        InputError: the extra is not installed, or demonstrations of another env.
+        InputError: the extra is not installed, demonstrations of another env, or an actor that
+            diverges.
         OutputExists: `out` holds something else.
     """
     check_extra(f"--algo {request.algo}", *_packages(request))
+    transitions = None
+    if request.algorithm.needs_demos and not (out / CARD).exists():
+        transitions = _replayed(request, demos, note)  # refuses them before the folder is begun
     wanted = {"algo": request.algo, "code_version": __version__, "request": to_mapping(request)}
     with training_in(out, wanted) as done, torch.random.fork_rng(devices=[]), one_thread():
         if done is not None:
             return done
-        learner = _learner(request, demos, workers)
+        learner = _learner(request, transitions, workers)
         try:
             return _run(request, learner, out, progress, tensorboard)
         finally:
@@ -126,6 +139,7 @@ def train_seeds(
     *,
     workers: int = 0,
     progress: Progress | None = None,
+    note: Note = untold,
     tensorboard: bool = True,
 ) -> None:
     """Train several requests in parallel, in `workers` processes; see `train`.
@@ -135,7 +149,13 @@ def train_seeds(
     jobs = list(zip(requests, outs, strict=True))
     if len(jobs) == 1 or not workers:
         for request, out in jobs:
-            train(request, demos, out, workers=workers, progress=progress, tensorboard=tensorboard)
+            train(
+                *(request, demos, out),
+                workers=workers,
+                progress=progress,
+                note=note,
+                tensorboard=tensorboard,
+            )
         return
     total = sum(request.total for request in requests)
     done = 0
@@ -146,7 +166,9 @@ def train_seeds(
             for request, out in batch
         ]
         hear = functools.partial(_show, progress or silent, done, total)
-        processes.run_all(calls, "the training", hear)
+        for notes in processes.run_all(calls, "the training", hear):
+            for text in notes:
+                note(text)
         done += sum(request.total for request, _ in batch)
 
 
@@ -156,13 +178,15 @@ def _train_reporting(
     out: Path,
     tensorboard: bool,
     report: Callable[[int], None],
-) -> None:
-    """Train in a worker process; `report` is called with the steps done."""
+) -> list[str]:
+    """Train in a worker process, reporting the steps done; return the notes."""
+    notes: list[str] = []
 
     def show(done: int, total: int, unit: str = "", /) -> None:
         report(done)
 
-    train(request, demos, out, progress=show, tensorboard=tensorboard)
+    train(request, demos, out, progress=show, note=notes.append, tensorboard=tensorboard)
+    return notes
 
 
 def _show(progress: Progress, before: int, total: int, steps: Sequence[int]) -> None:
@@ -175,14 +199,22 @@ def _packages(request: Request) -> tuple[str, ...]:
     return ("stable_baselines3", request.algorithm.library)
 
 
-def _learner(request: Request, demos: Sequence[Path], workers: int) -> Learner:
+def _replayed(request: Request, demos: Sequence[Path], note: Note) -> Transitions:
+    """Return the demonstrations as the request learns from them; note how many are left out."""
+    obs_type = "goal" if request.algorithm.has_hindsight else request.observation
+    rule = request.settings.success_rule
+    transitions = of_demos(demos, request.env, obs_type, success_rule=rule)
+    if transitions.failed:
+        note(
+            f"{transitions.failed} of {plural(len(demos), 'demonstration')} did not succeed when "
+            f"replayed with these options; '{request.algo}' learns from the others."
+        )
+    return transitions
+
+
+def _learner(request: Request, transitions: Transitions | None, workers: int) -> Learner:
     """Return the untrained learner of a request."""
     algorithm = request.algorithm
-    transitions = None
-    if algorithm.needs_demos:
-        obs_type = "goal" if algorithm.has_hindsight else request.observation
-        rule = request.settings.success_rule
-        transitions = of_demos(demos, request.env, obs_type, success_rule=rule)
     mean, std = _statistics(request, transitions)
     if algorithm.is_online:
         from surgicai_vision.rl.online import OnlineLearner
@@ -275,6 +307,8 @@ def _advance(request: Request, learner: Learner, target: int) -> dict[str, float
     """
     try:
         return learner.advance(target)
+    except Diverged as error:
+        raise _diverged(request, "its actions are") from error
     except ValueError as error:
         if not str(error).startswith(NOT_A_DISTRIBUTION):
             raise

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any, cast, final
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
@@ -45,6 +44,9 @@ class SuturingVecEnv(VecEnv):
         workers: worker processes; 0 steps all envs in this one. Processes are spawned, so a script
             needs the usual `if __name__ == "__main__":`.
         **arguments: what `envs.make_task` takes; `max_steps` limits an episode [control steps].
+
+    Attributes:
+        actions: the last actions given, (n_envs, 7).
     """
 
     def __init__(self, task: str, n_envs: int = 1, workers: int = 0, **arguments: Any):
@@ -53,7 +55,7 @@ class SuturingVecEnv(VecEnv):
         # a vector env of gymnasium declares neither `call` nor lists of seeds
         self._vector: Any = vector_of(n_envs, workers, AutoresetMode.SAME_STEP, self._arguments)
         self._local = make_task(**self._arguments)
-        self._actions: NDArray[np.float32] = np.zeros((n_envs, 7), np.float32)
+        self.actions: NDArray[np.float32] = np.zeros((n_envs, 7), np.float32)
         self._returns: NDArray[np.float64] = np.zeros(n_envs)
         self._lengths: NDArray[np.int64] = np.zeros(n_envs, np.int64)
         self._began = time.monotonic()
@@ -97,11 +99,11 @@ class SuturingVecEnv(VecEnv):
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Keep the actions (n_envs, 7) for `step_wait`."""
-        self._actions = np.asarray(actions, np.float32)
+        self.actions = np.asarray(actions, np.float32)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Take a step in every env; those that end are reset at once."""
-        observation, rewards, terminated, truncated, info = self._vector.step(self._actions)
+        observation, rewards, terminated, truncated, info = self._vector.step(self.actions)
         final_observations = info.pop("final_obs", None)
         final_info = info.pop("final_info", None)
         info.pop("_final_obs", None)
@@ -205,8 +207,3 @@ def _rows(info: Info, count: int) -> list[dict[str, Any]]:
         for index in np.flatnonzero(present).tolist():
             rows[index][key] = parts[index]
     return rows
-
-
-def is_goal(space: spaces.Space[Any]) -> bool:
-    """Return True for the observation space of obs_type "goal"."""
-    return isinstance(space, spaces.Dict) and "desired_goal" in space.spaces

@@ -9,10 +9,10 @@ from helpers.checkpoints import checkpoint
 from surgicai_vision.commands import folders, train
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import OutputExists
 from surgicai_vision.core.executor import RunContext
-from surgicai_vision.core.files import CACHE_VARIABLE
+from surgicai_vision.core.files import CACHE_VARIABLE, write_json
 from surgicai_vision.dataset import render_demos
 from surgicai_vision.demos.record import record
 from surgicai_vision.features.cache import list_cache
@@ -146,6 +146,36 @@ def test_the_folder_of_every_seed_is_checked_before_the_first_is_trained(
     monkeypatch.setattr("surgicai_vision.rl.residual.train_residual", train)
     assert main(["train", *given[option], "--seeds", "2"]) == 2
     assert len(set(checked)) == 2 and "already holds files" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--algo", "--low", "--residual-on"])
+def test_another_training_of_a_later_seed_is_refused_before_the_first_is_trained(
+    option, tmp_path, monkeypatch, capsys
+):
+    low = {**dict.fromkeys(names.SUBTASKS, "expert"), "hlp": "order", "termination": "privileged"}
+    (tmp_path / "low.yaml").write_text(yaml.safe_dump(low))
+    base = str(checkpoint(tmp_path / "base", "grasp"))
+    given = {
+        "--algo": ["--algo", "td3"],
+        "--low": ["--task", "suture", "--algo", "ppo", "--low", "low.yaml"],
+        "--residual-on": ["--algo", "td3", "--residual-on", base],
+    }
+    begun = []
+
+    def train(request, out, *rest, **options):
+        out = rest[0] if option == "--algo" else out
+        out.mkdir(parents=True)
+        write_json(out / "training.json", {"request": to_mapping(request)})
+        begun.append(request.seed)
+
+    monkeypatch.setattr("surgicai_vision.rl.train.train", train)
+    monkeypatch.setattr("surgicai_vision.rl.high_level.train_high_level", train)
+    monkeypatch.setattr("surgicai_vision.rl.residual.train_residual", train)
+    assert main(["train", *given[option], "--seed", "1"]) == 0
+    capsys.readouterr()
+    assert main(["train", *given[option], "--seeds", "2", "--validation", "7"]) == 2
+    assert "seed1 holds another training" in capsys.readouterr().err
+    assert begun == [1]
 
 
 @pytest.mark.parametrize("option", ["--low", "--residual-on"])

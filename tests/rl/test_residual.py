@@ -129,9 +129,29 @@ def test_control_steps_are_counted_where_an_action_is_held(tmp_path):
     assert [point["updates"] for point in curve] == [2, 8]  # one a decision, after four
 
 
-def test_the_actor_waits_for_its_critics(base, tmp_path):
-    train_residual(request_of(base, settings={"actor_starts": 24}), tmp_path / "waits")
-    assert not load_policy(tmp_path / "waits").correction[-1].weight.any()
+def test_the_actor_waits_for_its_critics(base):
+    training = residual._Training(request_of(base, settings={"actor_starts": 8}), open_policy(base))
+    last = linear(training.model.actor.mu)[-1]
+    training.model.learn(12)  # eight updates, after four actions
+    assert not last.weight.any()
+    training.model.learn(4, reset_num_timesteps=False)
+    assert last.weight.any()
+    training.close()
+
+
+def test_a_correction_whose_actor_would_not_learn_is_refused(base):
+    with pytest.raises(InputError, match="at most 20 updates, but the actor learns only after 20"):
+        request_of(base, settings={"actor_starts": 20})
+    with pytest.raises(InputError, match="at most 0 updates"):
+        request_of(base, settings={"learning_starts": 30})
+    with pytest.raises(InputError, match="at most 2000 updates"):
+        ResidualRequest(base, env_steps=5000)
+
+
+def test_a_correction_that_diverges_says_so_in_one_line(base, tmp_path):
+    request = request_of(base, settings={"learning_rate": 1e12})
+    with pytest.raises(InputError, match=r"correction diverged.*lower the learning rate"):
+        train_residual(request, tmp_path / "out")
 
 
 def test_the_actor_is_held_to_the_frozen_policy_as_its_loss_says(base):

@@ -17,13 +17,20 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
 from surgicai_vision.core.files import TEMPORARY
-from surgicai_vision.demos.store import demos_digest, list_demos
+from surgicai_vision.demos.store import (
+    demos_digest,
+    list_demos,
+    read_demo,
+    write_demo,
+    write_marker,
+)
 from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.rl import train as training
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.rl.settings import Request, Settings, settings_of
 from surgicai_vision.rl.train import train
+from surgicai_vision.rl.transitions import of_demos
 from surgicai_vision.training.folder import STATE
 from surgicai_vision.training.policies import load_policy
 
@@ -281,8 +288,9 @@ def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, caps
     shown = ("--demos", str(demos["grasp"]))
     for algo, share, rows in (("td3-bc", 0.001, 0), ("rlpd", 0.999, 256)):
         assert f"{rows} of the 256" in refused(algo, *shown, "--change", f"demo_share={share}")
-    for algo, unread in (("bc", "tau=0.1"), ("awac", "samples=4"), ("iql", "samples=4")):
-        assert f"setting of '{algo}'" in refused(algo, *shown, "--change", unread)
+    unread = (("bc", "tau=0.1"), ("bc", "gamma=0.9"), ("awac", "samples=4"), ("iql", "samples=4"))
+    for algo, change in unread:
+        assert f"setting of '{algo}'" in refused(algo, *shown, "--change", change)
     with pytest.raises(UnknownName, match="td3"):
         settings_of("td4", {})
     with pytest.raises(InputError, match="gamma is 1"):
@@ -293,9 +301,54 @@ def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, caps
         train(replace(request, seed=1), list_demos(demos["grasp"]), tmp_path / "a")
 
 
-@pytest.mark.parametrize("algo", ["ppo", "sac"])
+def test_a_training_that_would_end_before_its_first_update_is_refused(demos, tmp_path, capsys):
+    given = ["train", "--algo", "td3", "--out", str(tmp_path / "no"), "--env-steps"]
+    assert main([*given, "1000"]) == 2
+    assert "the first 1000 have random actions" in capsys.readouterr().err
+    request, _ = request_of("td3", demos)
+    first = request.settings.learning_starts
+    assert replace(request, env_steps=first + 1).random_steps == first
+    with pytest.raises(InputError, match=f"the first {first} have"):
+        replace(request, env_steps=first)
+    held = replace(request.env, action_repeat=2)
+    with pytest.raises(InputError, match=f"the first {2 * first} have"):
+        replace(request, env=held, env_steps=2 * first)
+
+
+@pytest.mark.parametrize("change", ["success_steps=3", "tolerance_share=0.5", "keeps_holes=true"])
+def test_a_rule_that_the_whole_procedure_does_not_read_is_refused(change, tmp_path, capsys):
+    given = ["train", "--algo", "ppo", "--task", "suture", "--out", str(tmp_path / "no")]
+    assert main([*given, "--change", change]) == 2
+    assert "are for one subtask" in capsys.readouterr().err
+
+
+def test_demonstrations_that_are_refused_leave_no_folder(demos, tmp_path, capsys):
+    out = tmp_path / "out"
+    given = ["train", "--algo", "bc", "--demos", str(demos["grasp"]), "--out", str(out)]
+    assert main([*given, "--change", "success_steps=30"]) == 2
+    assert "None of 2 demonstrations" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_demonstrations_that_are_left_out_are_told_once(
+    seeds, demos, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    first, second = (read_demo(path) for path in list_demos(demos["grasp"]))
+    write_demo(tmp_path, 0, first)
+    still = np.zeros_like(second.action)
+    write_demo(tmp_path, 1, replace(second, action=still, executed=still))
+    write_marker(tmp_path, "grasp", "expert")
+    given = ["train", "--algo", "bc", "--demos", ".", "--updates", "2", "--validation", "0"]
+    assert main([*given, "--seeds", str(seeds), "--workers", "2", "--log", "none"]) == 0
+    told = capsys.readouterr().err
+    assert told.count("1 of 2 demonstrations did not succeed when replayed") == 1
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac", "td3"])
 def test_a_training_that_diverges_says_so_in_one_line(algo, demos, tmp_path):
-    """The library's distribution of actions refuses the actor's mean or its deviation."""
+    """The library's distribution refuses the actor's mean or its deviation, or the env its NaN."""
     request, _ = request_of(algo, demos)
     settings = replace(request.settings, learning_rate=1e10)
     with pytest.raises(InputError, match=r"diverged.*lower the learning rate"):
@@ -328,7 +381,7 @@ def test_importing_the_verb_imports_no_library_of_the_extra(tmp_path):
 def test_whether_a_relabelled_goal_keeps_its_demand_follows_the_task():
     def keeps(task, **changes):
         settings = settings_of("td3-her", changes)
-        return Request("td3-her", TaskConfig(task), settings=settings, env_steps=1).keeps_demand
+        return Request("td3-her", TaskConfig(task), settings=settings, env_steps=2000).keeps_demand
 
     assert [keeps(task) for task in ("grasp", "place", "insert", "handoff", "pullout")] == [
         False, False, True, False, True,
@@ -338,5 +391,5 @@ def test_whether_a_relabelled_goal_keeps_its_demand_follows_the_task():
 
 def test_statistics_are_finite_and_floored(demos):
     request, paths = request_of("bc", demos)
-    learner = training._learner(request, paths, 0)
+    learner = training._learner(request, of_demos(paths, request.env), 0)
     assert torch.isfinite(learner.mean).all() and (learner.std >= training.SMALLEST_STD).all()

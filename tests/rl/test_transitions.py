@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from stable_baselines3.common.buffers import ReplayBuffer
 
 from surgicai_vision import envs
 from surgicai_vision.commands.main import main
@@ -156,6 +157,16 @@ def test_stable_baselines_reads_a_replay_buffer(demos, tmp_path):
     assert np.array_equal(buffer.rewards[:, 0], found.reward)
     assert np.array_equal(buffer.dones[:, 0], found.terminated)
     assert len(model.replay_buffer.sample(32).rewards) == 32
+
+
+def test_a_buffer_that_would_lose_transitions_is_refused(demos):
+    found = of_demos(list_demos(demos["grasp"]), obs_type="state")
+    space = export.space_of(found)
+    export.fill(ReplayBuffer(len(found), space, export.ACTIONS, device="cpu"), found)
+    smaller = ReplayBuffer(len(found) - 1, space, export.ACTIONS, device="cpu")
+    with pytest.raises(InputError, match=f"holds {len(found) - 1} transitions"):
+        export.fill(smaller, found)
+    assert not smaller.pos
 
 
 def test_stable_baselines_relabels_demonstrations(demos, tmp_path):
