@@ -40,9 +40,7 @@ ALL = "all"
 PLAIN = "plain"
 FAMILIES = {
     ALL: ("", *names.TRAIN_APPEARANCES, *names.HELDOUT_APPEARANCES),
-    names.TRAIN: names.TRAIN_APPEARANCES,
-    names.VARIED: names.VARIED_APPEARANCES,
-    names.HELDOUT: names.HELDOUT_APPEARANCES,
+    **names.APPEARANCE_SETS,
     PLAIN: ("",),
     **{name: (name,) for name in names.APPEARANCES},
 }

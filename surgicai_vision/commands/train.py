@@ -30,9 +30,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, read_changes, to_mapping
-from surgicai_vision.core.errors import InputError, OutputExists, check_at_most
-from surgicai_vision.core.files import read_json
-from surgicai_vision.core.untrusted import checked
+from surgicai_vision.core.errors import InputError, check_at_most
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.features import encoders
 from surgicai_vision.features.devices import find_device
@@ -438,17 +436,13 @@ def _checked_folders(
         OutputExists: a folder that holds something else.
     """
     from surgicai_vision.rl.settings import LARGEST_SEED
+    from surgicai_vision.training.folder import check_part
 
     check_at_most(LARGEST_SEED, seed=max(run.seed for run in runs))
     outs = [options.out or folders.train_folder(run.task, run.name, run.seed) for run in runs]
     for request, out in zip(requests, outs, strict=True):
         folders.check_folder(out, REQUEST, ours=(LOCK,))
-        if (out / REQUEST).exists():
-            recorded = checked(read_json(out / REQUEST), dict, str(out / REQUEST))
-            if recorded.get("request") != to_mapping(request):
-                raise OutputExists(
-                    f"{out} holds another training; remove it, or give another --seed or --out."
-                )
+        check_part(out, {"request": to_mapping(request)})
     return outs
 
 

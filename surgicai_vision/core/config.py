@@ -176,7 +176,7 @@ RANDOMISATION_CHOICES: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
     {
         "pair": ("", ANY),
         "needle_arc": tuple(CHOSEN_ARCS),
-        "appearance": ("", names.TRAIN, names.VARIED, names.HELDOUT, *names.APPEARANCES),
+        "appearance": ("", *names.APPEARANCE_SETS, *names.APPEARANCES),
     }
 )
 """Axis that is a choice → its possible values; "" is off."""

@@ -71,7 +71,10 @@ APPEARANCES = (*TRAIN_APPEARANCES, *HELDOUT_APPEARANCES, *VARIED_APPEARANCES)
 TRAIN = "train"
 HELDOUT = "heldout"
 VARIED = "varied"
-"""Sets of families, as `RandomisationConfig.appearance` names them."""
+APPEARANCE_SETS = MappingProxyType(
+    {TRAIN: TRAIN_APPEARANCES, VARIED: VARIED_APPEARANCES, HELDOUT: HELDOUT_APPEARANCES}
+)
+"""Sets of families, as `RandomisationConfig.appearance` names them → their families."""
 
 OBS_TYPES = ("state", "goal", "relative", "pixels", "pixels_agent_pos")
 REWARDS = ("sparse", "dense", "staged")

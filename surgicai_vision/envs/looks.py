@@ -14,13 +14,6 @@ from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.scene.visual.appearance import SEEDS, Appearance
 from surgicai_vision.scene.visual.distractors import MOST, Litter
 
-FAMILIES = {
-    names.TRAIN: names.TRAIN_APPEARANCES,
-    names.VARIED: names.VARIED_APPEARANCES,
-    names.HELDOUT: names.HELDOUT_APPEARANCES,
-}
-"""Set of looks → its families."""
-
 
 def draw(config: RandomisationConfig, rng: np.random.Generator) -> Mapping[str, tuple[float, ...]]:
     """Draw only a look: axis → its numbers, for the axes that are on in `config`."""
@@ -46,7 +39,7 @@ def _draw(families: str, rng: np.random.Generator) -> Appearance:
     seed = int(rng.integers(SEEDS))
     if not families:
         return Appearance()
-    chosen = FAMILIES.get(families, (families,))
+    chosen = names.APPEARANCE_SETS.get(families, (families,))
     return Appearance(chosen[int(share * len(chosen))], seed)
 
 

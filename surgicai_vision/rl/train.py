@@ -39,8 +39,13 @@ from surgicai_vision.rl.learner import Diverged, Learner
 from surgicai_vision.rl.settings import STOP_AFTER, Request, read_by
 from surgicai_vision.rl.transitions import Transitions, of_demos
 from surgicai_vision.scene.kinematics import base_in_world
-from surgicai_vision.training.checkpoint import CARD, Checkpoint, write_checkpoint
-from surgicai_vision.training.folder import read_state, training_in, write_state
+from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
+from surgicai_vision.training.folder import (
+    finished_training,
+    read_state,
+    training_in,
+    write_state,
+)
 from surgicai_vision.training.policies import policy_plugin
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
@@ -118,10 +123,12 @@ def train(
         OutputExists: `out` holds something else.
     """
     check_extra(f"--algo {request.algo}", *_packages(request))
-    transitions = None
-    if request.algorithm.needs_demos and not (out / CARD).exists():
-        transitions = _replayed(request, demos, note)  # refuses them before the folder is begun
     wanted = {"algo": request.algo, "code_version": __version__, "request": to_mapping(request)}
+    if (done := finished_training(out, wanted)) is not None:
+        return done
+    transitions = None
+    if request.algorithm.needs_demos:
+        transitions = _replayed(request, demos, note)  # refuses them before the folder is begun
     with training_in(out, wanted) as done, torch.random.fork_rng(devices=[]), one_thread():
         if done is not None:
             return done

@@ -30,6 +30,7 @@ from surgicai_vision.core.files import (
     write_bytes,
     write_json,
 )
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.training.checkpoint import (
     CARD,
     LOCK,
@@ -58,7 +59,7 @@ def training_in(out: Path, request: Mapping[str, object]) -> Iterator[Checkpoint
         OutputExists: `out` holds something else.
         InputError: another process is training into it.
     """
-    if (done := _finished(out, request)) is not None:
+    if (done := finished_training(out, request)) is not None:
         yield done
         return
     out.mkdir(parents=True, exist_ok=True)
@@ -66,7 +67,7 @@ def training_in(out: Path, request: Mapping[str, object]) -> Iterator[Checkpoint
         f"Another run is training into {out}; wait for it, stop it or give another --out."
     )
     with locked(out / LOCK, refusal=refusal):
-        done = _finished(out, request)  # another process may have finished it meanwhile
+        done = finished_training(out, request)  # another process may have finished it meanwhile
         if done is None:
             for folder in (out, *out.glob("epochs/*")):
                 remove_partial(folder, (REQUEST, STATE, WEIGHTS, CARD))
@@ -75,19 +76,47 @@ def training_in(out: Path, request: Mapping[str, object]) -> Iterator[Checkpoint
         _remove_state(out)
 
 
-def _finished(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
-    """Return the checkpoint of a finished training; None if there is something left to train."""
+def finished_training(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
+    """Return the checkpoint of a finished training; None if there is something left to train.
+
+    Args:
+        out: the checkpoint folder, which need not exist.
+        request: everything that decides the result, as plain data.
+
+    Raises:
+        OutputExists: `out` holds something else.
+    """
     check_output(out, may_resume=REQUEST, ours=(LOCK,))
     if (out / REQUEST).exists() and read_json(out / REQUEST) != request:
-        raise OutputExists(
-            f"--out {out} holds another training; give a folder that does not exist yet."
-        )
+        raise _another(out)
     if not (out / CARD).exists():
         return None
     checkpoint = read_checkpoint(out)
     with suppress(OSError):  # left by a process that was killed after its last write
         _remove_state(out)
     return checkpoint
+
+
+def check_part(out: Path, part: Mapping[str, object]) -> None:
+    """Refuse a folder whose training differs in some of what decides its result.
+
+    For callers that do not know the whole request before they begin.
+
+    Raises:
+        OutputExists: it differs.
+    """
+    if not (out / REQUEST).exists():
+        return
+    recorded = checked(read_json(out / REQUEST), dict, str(out / REQUEST))
+    if any(recorded.get(key) != value for key, value in part.items()):
+        raise _another(out)
+
+
+def _another(out: Path) -> OutputExists:
+    """Return the refusal of a folder that holds another training."""
+    return OutputExists(
+        f"--out {out} holds another training; give a folder that does not exist yet."
+    )
 
 
 def write_state(out: Path, state: Mapping[str, Any]) -> None:

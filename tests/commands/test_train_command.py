@@ -120,17 +120,23 @@ def test_a_checkpoint_is_named_by_the_task_of_its_data(tmp_path, capsys):
     assert "--task grasp: demos shows place" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--low", "--residual-on"])
-def test_the_folder_of_every_seed_is_checked_before_the_first_is_trained(
-    option, tmp_path, monkeypatch, capsys
-):
+@pytest.fixture
+def trainings(tmp_path):
+    """Return option → a training by it, small enough to begin at once."""
     low = {**dict.fromkeys(names.SUBTASKS, "expert"), "hlp": "order", "termination": "privileged"}
     (tmp_path / "low.yaml").write_text(yaml.safe_dump(low))
     base = str(checkpoint(tmp_path / "base", "grasp"))
-    given = {
+    return {
+        "--algo": ["--algo", "td3"],
         "--low": ["--task", "suture", "--algo", "ppo", "--low", "low.yaml"],
         "--residual-on": ["--algo", "td3", "--residual-on", base],
     }
+
+
+@pytest.mark.parametrize("option", ["--low", "--residual-on"])
+def test_the_folder_of_every_seed_is_checked_before_the_first_is_trained(
+    option, trainings, monkeypatch, capsys
+):
     checked = []
 
     def check(out, marker, ours=()):
@@ -144,22 +150,14 @@ def test_the_folder_of_every_seed_is_checked_before_the_first_is_trained(
     monkeypatch.setattr(folders, "check_folder", check)
     monkeypatch.setattr("surgicai_vision.rl.high_level.train_high_level", train)
     monkeypatch.setattr("surgicai_vision.rl.residual.train_residual", train)
-    assert main(["train", *given[option], "--seeds", "2"]) == 2
+    assert main(["train", *trainings[option], "--seeds", "2"]) == 2
     assert len(set(checked)) == 2 and "already holds files" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--algo", "--low", "--residual-on"])
 def test_another_training_of_a_later_seed_is_refused_before_the_first_is_trained(
-    option, tmp_path, monkeypatch, capsys
+    option, trainings, monkeypatch, capsys
 ):
-    low = {**dict.fromkeys(names.SUBTASKS, "expert"), "hlp": "order", "termination": "privileged"}
-    (tmp_path / "low.yaml").write_text(yaml.safe_dump(low))
-    base = str(checkpoint(tmp_path / "base", "grasp"))
-    given = {
-        "--algo": ["--algo", "td3"],
-        "--low": ["--task", "suture", "--algo", "ppo", "--low", "low.yaml"],
-        "--residual-on": ["--algo", "td3", "--residual-on", base],
-    }
     begun = []
 
     def train(request, out, *rest, **options):
@@ -171,9 +169,9 @@ def test_another_training_of_a_later_seed_is_refused_before_the_first_is_trained
     monkeypatch.setattr("surgicai_vision.rl.train.train", train)
     monkeypatch.setattr("surgicai_vision.rl.high_level.train_high_level", train)
     monkeypatch.setattr("surgicai_vision.rl.residual.train_residual", train)
-    assert main(["train", *given[option], "--seed", "1"]) == 0
+    assert main(["train", *trainings[option], "--seed", "1"]) == 0
     capsys.readouterr()
-    assert main(["train", *given[option], "--seeds", "2", "--validation", "7"]) == 2
+    assert main(["train", *trainings[option], "--seeds", "2", "--validation", "7"]) == 2
     assert "seed1 holds another training" in capsys.readouterr().err
     assert begun == [1]
 
