@@ -321,7 +321,7 @@ def test_demonstrations_that_go_on_hold_no_actions(goes_on, tmp_path):
 def test_a_procedure_that_waits_to_be_told_is_refused(demonstrator, tmp_path):
     """Its env would stay in the grasp until every episode has reached its limit."""
     told = TaskConfig(names.SUTURE, advance="told")
-    with pytest.raises(InputError, match="no episode could succeed"):
+    with pytest.raises(InputError, match=r"[Ll]eave env\.advance out"):
         record(
             told,
             episodes=1,
