@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from lerobot.configs import PolicyFeature
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import OBS_STATE
 from numpy.typing import NDArray
@@ -75,6 +76,13 @@ class SurgicaiCheckpointPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy 
             raise InputError(
                 f"{config.checkpoint} needs depth, which LeRobot's env does not provide; "
                 "use 'surgicai-vision evaluate'."
+            )
+        given: dict[str, PolicyFeature] = config.input_features or {}
+        hidden = [view for view in self._agent.cameras if names.image_key(view) not in given]
+        if given and hidden:  # without any, the env is not known yet
+            raise InputError(
+                f"{config.checkpoint} needs {', '.join(hidden)}; given: {', '.join(given)}: "
+                f"give --env.checkpoint={config.checkpoint}, and no other --env.cameras."
             )
         self._slots = 0
         self._seed = 0

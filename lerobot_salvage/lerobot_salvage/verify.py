@@ -261,6 +261,8 @@ class Verifier:
                 first = round(begin * self.files.fps)
             except (OverflowError, TypeError, ValueError):  # missing, no number, or infinite
                 raise _Unfit(f"its place in the videos of {key} is not numbers.") from None
+            if first < 0:
+                raise _Unfit(f"its place in the videos of {key} is before their beginning.")
             if named not in files:
                 raise _Unfit(f"the video {named.relative_to(self.files.path)} is missing.")
             return files.index(named), first
@@ -315,10 +317,14 @@ def _array(column: pa.ChunkedArray, features: Features, key: str) -> NDArray[np.
         raise _Unfit(f"{key} has {column.null_count} missing values.")
     flat = column.combine_chunks()
     count = len(column)
+    shape = features.get(key, {"shape": (1,)})["shape"]
+    sides = iter(shape)
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
+        # Rows of other lengths may have the right number of values together.
+        if pc.unique(pc.list_value_length(flat)).to_pylist() != [next(sides, None)]:
+            raise _Unfit(f"{key} has rows that are not of shape {shape}.")
         flat = pc.list_flatten(flat)
     values = np.asarray(flat)
-    shape = features.get(key, {"shape": (1,)})["shape"]
     whole = (count,) if shape == (1,) else (count, *shape)
     if values.size != int(np.prod(whole)):
         raise _Unfit(f"{key} has {values.size} values, not {count} × {shape}.")

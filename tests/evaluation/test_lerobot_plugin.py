@@ -642,6 +642,40 @@ def test_what_evaluate_cannot_use_is_refused_in_one_line(trained: Path, tmp_path
         open_policy(changed(source, tmp_path / "typeless", type=None))
 
 
+STEP_FILES = ("policy_preprocessor.json", "policy_postprocessor.json")
+
+
+def write_steps(folder: Path, **steps: Any) -> Path:
+    """Write a checkpoint's files of processing steps: ours in both, more where they are given."""
+    ours = [
+        {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}},
+        {"class": "lerobot.processor.pipeline.IdentityProcessorStep"},
+    ]
+    for name in STEP_FILES:
+        table = {"name": name, "steps": ours + steps.get(Path(name).stem, [])}
+        (folder / name).write_text(json.dumps(table))
+    return folder
+
+
+@pytest.mark.parametrize("file", [Path(name).stem for name in STEP_FILES])
+@pytest.mark.parametrize(
+    "named", ["subprocess.Popen", "lerobot.processor.pipeline.json", "a..b", 7]
+)
+def test_a_processing_step_never_runs_a_program(named: object, file: str, tmp_path: Path) -> None:
+    from surgicai_vision.evaluation import lerobot_agent
+
+    ran = tmp_path / "ran"
+    step = {"class": named, "config": {"args": ["touch", str(ran)]}}
+    folder = write_steps(tmp_path, **{file: [step]})
+    with pytest.raises(BadFile, match=r"is refused|must be text"):
+        lerobot_agent.LeRobotAgent("act", folder, lerobot_agent.Inputs((), SIZE), "Grasp.")
+    assert not ran.exists()
+    lerobot_agent.check_steps(write_steps(tmp_path))
+    (folder / f"{file}.json").unlink()
+    with pytest.raises(BadFile, match=file):
+        lerobot_agent.check_steps(folder)
+
+
 # -- LeRobot's tools on our dataset ----------------------------------------------------------------
 
 
@@ -742,6 +776,20 @@ def test_a_policy_of_lerobot_trains_on_cached_features(
     assert action.shape == (1, 7) and action.abs().max() <= 1
     told = [[repr(episode.row) for episode in episodes] for episodes in (one, other)]  # of NaN too
     assert told[0] == told[1]
+
+
+def test_a_checkpoint_whose_views_the_env_does_not_show_is_refused() -> None:
+    from lerobot.configs import FeatureType, PolicyFeature
+    from lerobot_env_surgicai.modeling_surgicai_checkpoint import SurgicaiCheckpointPolicy
+
+    from lerobot_env_surgicai import SurgicaiCheckpointConfig
+
+    shown = {"observation.images.wrist_psm1": PolicyFeature(FeatureType.VISUAL, (3, SIZE, SIZE))}
+    config = SurgicaiCheckpointConfig(
+        checkpoint="released:handoff", input_features=shown, device="cpu"
+    )
+    with pytest.raises(InputError, match=r"needs front_psm1, .*wrist_psm1: give --env.checkpoint"):
+        SurgicaiCheckpointPolicy(config)
 
 
 @pytest.mark.parametrize("name", CHUNKS)

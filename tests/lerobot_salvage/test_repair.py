@@ -315,6 +315,29 @@ def test_a_place_in_the_videos_that_is_no_number_ends_the_prefix(tmp_path, colum
     assert repair_dataset(tmp_path / "set").episodes == 1
 
 
+def test_a_place_before_a_depth_video_ends_the_prefix(tmp_path):
+    write_lerobot(tmp_path / "set", video=True).finalize()
+    describe(tmp_path / "set", CAMERA, info={"is_depth_map": True})
+    rows = next(tmp_path.glob("set/meta/episodes/*/*.parquet"))
+    change(rows, f"videos/{CAMERA}/from_timestamp", 1, -0.2)
+    problems = check_dataset(tmp_path / "set").problems
+    said = f"episode 1: its place in the videos of {CAMERA} is before their beginning."
+    assert said in problems
+
+
+def test_rows_of_other_lengths_end_the_prefix(tmp_path, foreign):
+    folder = shutil.copytree(foreign / "whole", tmp_path / "set")
+    table = pq.read_table(folder / DATA)
+    index = table.schema.get_field_index(names.STATE)
+    states = table.column(names.STATE).to_pylist()
+    states[LENGTHS[0]], states[LENGTHS[0] + 1] = [0.0] * 3, [0.0] * 5  # of 4 values each
+    lists = pa.array(states, pa.list_(pa.float32()))
+    pq.write_table(table.set_column(index, names.STATE, lists), folder / DATA)
+    said = f"episode 1: {names.STATE} has rows that are not of shape (4,)."
+    assert said in check_dataset(folder).problems
+    assert repair_dataset(folder).episodes == 1
+
+
 def test_large_images_and_an_empty_info_are_allowed(tmp_path, foreign):
     folder = shutil.copytree(foreign / "killed", tmp_path / "set")
     describe(folder, CAMERA, shape=[2160, 3840, 3], info=None)
