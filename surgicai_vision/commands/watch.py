@@ -23,6 +23,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.features.encoders import WeightsSource
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Play episodes for a person to watch, and print how each ended."""
-    from surgicai_vision.envs.live.browser import LivePage
+    from surgicai_vision.envs.live.browser import MAX_VIEWS, LivePage
     from surgicai_vision.envs.live.views import LiveViews
     from surgicai_vision.envs.live.window import Window, check_display
     from surgicai_vision.evaluation.films import outcome_of
@@ -89,6 +90,11 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
     if options.window:
         check_display()
+    if len(options.view) > MAX_VIEWS:
+        raise InputError(
+            f"--view names {len(options.view)} views; the page shows at most {MAX_VIEWS} at the "
+            "same time. Leave some out; its buttons change them."
+        )
     spec = open_given(
         options.policy,
         options.task,

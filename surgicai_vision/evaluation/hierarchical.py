@@ -213,6 +213,7 @@ class HierarchicalAgent(Agent):
         self._agents = [*self._low, *([self._high] if self._high else [])]
         self.privileged = not learned or any(agent.privileged for agent in self._agents)
         self.cameras, self.image_size = common_images(self._agents)
+        self.depth = any(agent.depth for agent in self._agents)
         self._slots: dict[int, _EpisodeState] = {}
         self._features: FeatureTable = {}
         for agent in self._agents:

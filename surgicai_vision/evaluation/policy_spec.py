@@ -500,8 +500,13 @@ def _low_level(subtask: str, policy: str, weights: WeightsSource) -> PolicySpec:
     """Return the policy of a subtask, named in the file of a hierarchical policy.
 
     Raises:
-        InputError: it names code, or was trained for another subtask.
+        InputError: it names code or a hierarchical policy, or was trained for another subtask.
     """
+    if Path(policy).suffix in SUFFIXES:  # it could even name the file that names it
+        raise InputError(
+            f"{subtask}: {policy} is a hierarchical policy, which does the whole procedure; give "
+            f"a checkpoint or a baseline ({', '.join(BASELINES)})."
+        )
     if _names_code(policy):
         raise InputError(
             f"{subtask}: {policy} names code, which is not allowed in a file; give "

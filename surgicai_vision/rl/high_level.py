@@ -106,7 +106,8 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
     def __init__(self, config: HierarchicalConfig, task: TaskConfig, low: Sequence[Agent]):
         self.config = config
         self._low = list(low)
-        self._env = cast(Suture, env_showing(task, *common_images(self._low)))
+        depth = any(agent.depth for agent in self._low)
+        self._env = cast(Suture, env_showing(task, *common_images(self._low), depth=depth))
         self._observation: Any = None
         self._decisions = 0
         self.control_steps = 0
@@ -346,7 +347,9 @@ def _evaluate(
     stages = 0.0
     if request.validation:
         high = functools.partial(PolicyAgent, HLP, policy, None, (), IMAGE_SIZE, (names.BOTH_ARMS,))
-        make = functools.partial(HierarchicalAgent, request.low, low, high)
+        make = functools.partial(
+            HierarchicalAgent, request.low, low, high, action_repeat=task.action_repeat
+        )
         seeds = range(names.VALIDATION_SEED, names.VALIDATION_SEED + request.validation)
         episodes = run_share(make, task, seeds, EVALUATED_AT_ONCE, report=lambda _: None)
         successes = sum(episode.row.success for episode in episodes)

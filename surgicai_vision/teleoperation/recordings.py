@@ -16,6 +16,7 @@ from surgicai_vision.core.banks import check_training_starts
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
 from surgicai_vision.core.files import TEMPORARY, check_output, locked
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.demos.store import (
     MARKER,
     Demo,
@@ -54,9 +55,15 @@ class Recordings:
 
     @property
     def next_seed(self) -> int:
-        """Return the first seed after all that were kept or given up."""
+        """Return the first seed after all that were kept or given up.
+
+        Raises:
+            InputError: it is reserved for validation or tests.
+        """
         used = [*self.seeds, *(row["seed"] for row in self.skipped)]
-        return max(used, default=int(self._request["seed"]) - 1) + 1
+        seed = max(used, default=int(self._request["seed"]) - 1) + 1
+        check_training_starts(seed, 1)
+        return seed
 
     def keep(self, demo: Demo) -> Path:
         """Write an episode, whole or not at all; the folder has a marker before its first one."""
@@ -89,7 +96,7 @@ def open_recordings(
     """Open a folder to add episodes to, and lock out other sessions meanwhile.
 
     Args:
-        folder: created if it does not exist; removed again if nothing was written to it.
+        folder: created if it does not exist, and then removed again if nothing was written to it.
         config: the task; a folder holds a single one.
         scene_hash: hash of the compiled scene.
         seed: first seed of a new folder, 0 by default; an existing one is continued.
@@ -102,17 +109,19 @@ def open_recordings(
     """
     check_training_starts(seed or names.TRAIN_SEED, 1)
     check_output(folder, may_resume=MARKER)
+    is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
+    whole = folder.resolve()  # a folder has one lock, whatever link or "." it is given as
     refusal = SurgicaiError(
         f"--out {folder}: another session is recording there; give another folder."
     )
-    with locked(folder.with_name(f".{folder.name}.lock"), refusal=refusal):
+    with locked(whole.with_name(f".{whole.name}.lock"), refusal=refusal):
         for leftover in folder.glob(f"{TEMPORARY}*"):
             leftover.unlink(missing_ok=True)
         try:
             yield _read(folder, config, scene_hash, seed)
         finally:
-            if not any(folder.iterdir()):
+            if is_new and not any(folder.iterdir()):
                 folder.rmdir()
 
 
@@ -129,7 +138,7 @@ def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -
     marker = read_marker(folder)
     stored = marker.get("request")
     if seed is None and isinstance(stored, dict):
-        request["seed"] = stored.get("seed", 0)
+        request["seed"] = checked(stored.get("seed", 0), int, f"{folder / MARKER}: request: seed")
     if not is_same_request(stored, request):
         raise OutputExists(
             f"--out {folder} holds demonstrations of another command, task or scene "
@@ -138,7 +147,12 @@ def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -
     paths = list_demos(folder) if any(folder.glob("episode_*")) else []
     seeds = marker.get("seeds")
     skipped = marker.get("skipped")
-    if not (isinstance(seeds, list) and isinstance(skipped, list)):
+    if not (
+        isinstance(seeds, list)
+        and isinstance(skipped, list)
+        and all(isinstance(row, dict) for row in skipped)
+        and all(isinstance(used, int) for used in [*seeds, *(row.get("seed") for row in skipped)])
+    ):
         raise BadFile(
             f"{folder / MARKER} does not say which seeds were kept and given up; "
             "give another folder."

@@ -15,6 +15,7 @@ A session has no clock: the same inputs give the same files.
 from dataclasses import dataclass
 
 from surgicai_vision.core import names
+from surgicai_vision.core.errors import PhysicsError
 from surgicai_vision.demos.rollout import EpisodeRecorder
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.teleoperation.input_map import InputMapping
@@ -25,6 +26,8 @@ WAITING = "waiting"
 DRIVING = "driving"
 JUDGED = "judged"
 STOPPED = "stopped"
+MOST_UNMADE = 20
+"""Starts in a row that cannot be made after which a session ends."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ class Session:
         self._was_released = False
         self._state = WAITING
         self._message = ""
-        self._reset(recordings.next_seed)
+        self._go_on()
 
     @property
     def over(self) -> bool:
@@ -186,7 +189,7 @@ class Session:
             self.skipped += 1
             seed = self._attempt.seed
             self._recordings.skip(seed, "given up")
-            self._reset(self._recordings.next_seed, f"Start {seed} given up.")
+            self._go_on(f"Start {seed} given up.")
 
     @property
     def _keepable(self) -> bool:
@@ -210,7 +213,8 @@ class Session:
         if self.rules.skip_idle and is_idle:
             return
         if self._attempt.step(self._mapping.action(user_input, self.view)):
-            self._judge("time is up" if self._attempt.is_physical else "physics error")
+            reason = "the needle is dropped" if self._attempt.info.get("dropped") else "time is up"
+            self._judge(reason if self._attempt.is_physical else "physics error")
             if self._attempt.success and self.rules.auto_keep:
                 self._keep()
 
@@ -234,7 +238,7 @@ class Session:
             self._state = STOPPED
             self._message = f"{kept} All {self.kept} episodes are recorded."
             return
-        self._reset(self._recordings.next_seed, kept)
+        self._go_on(kept)
 
     def _stop(self) -> None:
         """Stop; a success that waits is kept, an attempt under way is discarded."""
@@ -244,6 +248,21 @@ class Session:
             self.discarded += 1
         self._state = STOPPED
         self._message = f"{self.kept} kept. Everything is written."
+
+    def _go_on(self, message: str = "") -> None:
+        """Wait at the next start; one that cannot be made is given up."""
+        for _ in range(MOST_UNMADE):
+            seed = self._recordings.next_seed
+            try:
+                self._reset(seed, message)
+                return
+            except PhysicsError as error:
+                self._recordings.skip(seed, str(error))
+                self.skipped += 1
+                message = f"{message} Start {seed} cannot be made, so it is left out.".strip()
+        raise PhysicsError(
+            f"{MOST_UNMADE} starts of '{self.env.config.task}' in a row cannot be made."
+        )
 
     def _reset(self, seed: int, message: str = "") -> None:
         """Wait at the start of `seed`."""

@@ -354,6 +354,16 @@ def test_the_reading_process_has_one_thread_when_it_leaves_the_network():
     assert child.stdout.split() == ["1"], child.stderr
 
 
+def test_the_reading_process_imports_nothing_from_the_current_folder(
+    tmp_path, recording, monkeypatch
+):
+    for name in ("argparse", "resource", "tempfile"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'trace')!r}, 'w')")
+    monkeypatch.chdir(tmp_path)
+    assert len(read_sandboxed(recording.resolve())["action"])
+    assert not (tmp_path / "trace").exists()
+
+
 def test_what_the_child_cannot_finish_is_a_bad_file(tmp_path, recording, monkeypatch):
     monkeypatch.setattr(sandbox, "WALL_SECONDS", 0.01)
     with pytest.raises(BadFile, match="was not read within"):

@@ -1,6 +1,7 @@
 """Hierarchical policies: high-level policy, low-level policies, terminations, limits."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,6 +25,7 @@ from surgicai_vision.evaluation.hierarchical_config import (
 from surgicai_vision.evaluation.metrics import summary
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.rollout import evaluate
+from surgicai_vision.evaluation.slot import Slot
 from surgicai_vision.training.checkpoint import (
     StageErrors,
     read_checkpoint,
@@ -79,6 +81,7 @@ class Saying:
 
     cameras = ()
     image_size = 224
+    depth = False
     privileged = False
     action_mode = names.INCREMENTS
 
@@ -338,6 +341,20 @@ def test_low_level_policies_share_features() -> None:
     assert encoded == [2, 1]
 
 
+def test_a_policy_that_sees_depth_is_shown_it() -> None:
+    policy = SimpleNamespace(act=lambda features, vectors: np.zeros((len(vectors), 7)))
+
+    def encoder(frames: np.ndarray) -> np.ndarray:
+        return np.zeros((len(frames), 2), np.float32)
+
+    encoder.fingerprint = "one"  # type: ignore[attr-defined]
+    seeing = partial(PolicyAgent, "a", policy, encoder, ("front_depth",), 32)
+    config = HierarchicalConfig("order", **PRIVILEGED)
+    slot = Slot(0, HierarchicalAgent(config, [seeing] * 5), TaskConfig(names.SUTURE))
+    slot.begin(0)
+    assert slot.agent.act([0], [slot.env], [slot.observation]).tolist() == [[0.0] * 7]
+
+
 def test_wrong_hierarchical_policies_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -353,6 +370,12 @@ def test_wrong_hierarchical_policies_are_refused(
         hierarchical_policy(HierarchicalConfig("order", **{**PRIVILEGED, "grasp": hlp}))
     with pytest.raises(BadFile, match="not a checkpoint"):
         hierarchical_policy(HierarchicalConfig(str(tmp_path), **EXPERTS))
+    itself = tmp_path / "itself.yaml"
+    itself.write_bytes(
+        hierarchical_yaml(HierarchicalConfig("order", **{**PRIVILEGED, "grasp": str(itself)}))
+    )
+    with pytest.raises(InputError, match=r"grasp: .*itself\.yaml is a hierarchical policy"):
+        open_policy(itself)
     with pytest.raises(InputError, match="needs a high-level policy"):
         HierarchicalConfig("order", **EXPERTS)
     with pytest.raises(UnknownName, match="termination"):

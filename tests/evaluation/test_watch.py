@@ -11,10 +11,19 @@ import pytest
 from browser import CHROMIUM, Browser
 
 from surgicai_vision.commands.main import main
+from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import PhysicsError
 from surgicai_vision.envs.base import SuturingEnv
-from surgicai_vision.envs.live.browser import ENDED, PAUSED, PLAYING, STOPPED, Command, LivePage
+from surgicai_vision.envs.live.browser import (
+    ENDED,
+    MAX_VIEWS,
+    PAUSED,
+    PLAYING,
+    STOPPED,
+    Command,
+    LivePage,
+)
 from surgicai_vision.envs.live.window import KEYS
 from surgicai_vision.evaluation.agents import ExpertAgent, RandomAgent
 from surgicai_vision.evaluation.rollout import evaluate
@@ -156,6 +165,12 @@ def test_a_port_in_use_and_a_missing_display_are_said_before_any_work(capsys, mo
     assert "is not free" in capsys.readouterr().err
     assert main(["watch", "zero", "--window"]) == 2
     assert "needs a display" in capsys.readouterr().err
+
+
+def test_more_views_than_the_page_takes_are_refused(capsys):
+    views = camera_names()[: MAX_VIEWS + 1]
+    assert main(["watch", "zero", "--view", ",".join(views)]) == 2
+    assert f"shows at most {MAX_VIEWS}" in capsys.readouterr().err
 
 
 def start(*arguments, prefix=()):

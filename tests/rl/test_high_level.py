@@ -171,6 +171,22 @@ def test_a_kill_changes_no_result(tmp_path, temporary, monkeypatch):
     assert resumed.policy_sha256 == whole.policy_sha256
 
 
+def test_a_validation_counts_the_control_steps_of_held_actions(monkeypatch):
+    made = []
+
+    def run(make, task, seeds, at_once, report):
+        made.append(make())
+        return [SimpleNamespace(row=SimpleNamespace(success=False, stages=0))]
+
+    monkeypatch.setattr(high_level, "run_share", run)
+    request = dataclasses.replace(request_of(), validation=1)
+    held = TaskConfig(names.SUTURE, action_repeat=4)
+    low = [BASELINES["zero"]] * len(names.SUBTASKS)
+    played = SimpleNamespace(control_steps=0)
+    high_level._evaluate(request, held, low, SimpleNamespace(), 8, played, 0.0)
+    assert [agent._action_repeat for agent in made] == [4]
+
+
 def test_images_of_several_sizes_are_refused_before_the_folder_is_begun(tmp_path, monkeypatch):
     sizes = iter((16, 32, 16, 16, 16))
 

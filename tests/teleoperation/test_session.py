@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from teleoperators import REST, SHORT, VIEWS, FakeMapping, Script, SessionEnv, event, right
@@ -13,7 +14,13 @@ from told_clock import Clock
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.core.errors import (
+    BadFile,
+    InputError,
+    OutputExists,
+    PhysicsError,
+    SurgicaiError,
+)
 from surgicai_vision.core.files import write_json
 from surgicai_vision.core.pacer import Pacer
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_marker
@@ -177,6 +184,40 @@ def test_an_episode_that_diverged_is_never_kept(open_session):
     assert ticks(session, event(KEEP)).kept == 0
 
 
+def test_a_dropped_needle_is_said(open_session):
+    session = open_session()
+    step = session.env.step
+    session.env.step = lambda action: (
+        *step(action)[:3],
+        True,
+        {**step(action)[4], "dropped": True},
+    )
+    assert "the needle is dropped" in ticks(session, REST, right()).message
+
+
+def test_a_start_that_cannot_be_made_is_left_out(open_session, tmp_path, monkeypatch):
+    reset = SessionEnv.reset
+
+    def failing(env, *, seed=None, options=None):
+        if seed in (0, 2):
+            raise PhysicsError("No start was physical.")
+        return reset(env, seed=seed)
+
+    monkeypatch.setattr(SessionEnv, "reset", failing)
+    session = open_session()
+    assert (session.status().seed, session.status().skipped) == (1, 1)
+    succeed(session)
+    status = ticks(session, event(KEEP))
+    assert (status.kept, status.seed) == (1, 3)
+    assert "Start 2 cannot be made" in status.message
+    assert open_session().status().seed == 3, "the folder goes on after it"
+    assert read_marker(tmp_path / "demos")["seeds"] == [1]
+
+    monkeypatch.setattr(SessionEnv, "reset", lambda *_, **__: failing(None, seed=0))
+    with pytest.raises(PhysicsError, match="in a row"):
+        open_session()
+
+
 # -- recordings ------------------------------------------------------------------------------------
 
 
@@ -261,6 +302,48 @@ def test_starts_that_are_counted_on_are_refused(tmp_path):
     ):
         pass
     assert not list(tmp_path.iterdir())
+
+
+def test_a_session_does_not_run_on_into_starts_that_are_counted_on(open_session, tmp_path):
+    session = open_session(seed=names.VALIDATION_SEED - 1)
+    succeed(session)
+    with pytest.raises(InputError, match="reserved for validation"):
+        session.tick(event(KEEP))
+    assert len(list_demos(tmp_path / "demos")) == 1, "the episode is kept all the same"
+    with pytest.raises(InputError, match="reserved for validation"):
+        open_session()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"seeds": ["a"]},
+        {"skipped": [7]},
+        {"skipped": [{"reason": "given up"}]},
+        {"request": "seed"},
+    ],
+)
+def test_a_damaged_list_of_seeds_is_one_line(open_session, tmp_path, damage):
+    keep_one(open_session())
+    marker = read_marker(tmp_path / "demos")
+    if damage == {"request": "seed"}:
+        damage = {"request": {**marker["request"], "seed": "first"}}
+    write_json(tmp_path / "demos" / "demos.json", {**marker, **damage})
+    with pytest.raises(BadFile, match=r"demos\.json"):
+        open_session()
+
+
+def test_the_current_folder_and_a_link_are_folders_like_others(tmp_path, monkeypatch):
+    (tmp_path / "demos").mkdir()
+    (tmp_path / "link").symlink_to("demos")
+    monkeypatch.chdir(tmp_path / "demos")
+    with (
+        open_recordings(Path(), SHORT, "f" * 64),
+        pytest.raises(SurgicaiError, match="another session"),
+        open_recordings(tmp_path / "link", SHORT, "f" * 64),
+    ):
+        pass
+    assert (tmp_path / "demos").is_dir(), "a folder that was there before stays"
 
 
 def test_another_task_scene_or_seed_is_refused(tmp_path):
@@ -384,6 +467,13 @@ def test_held_actions_are_refused(monkeypatch, tmp_path, capsys):
     (tmp_path / "held.yaml").write_text("env: {action_repeat: 2}")
     assert main(["teleoperate", "--config", "held.yaml"]) == 2
     assert "action_repeat is 2" in capsys.readouterr().err
+
+
+def test_a_procedure_that_nobody_tells_to_go_on_is_refused(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "told.yaml").write_text("env: {advance: told}")
+    assert main(["teleoperate", "--task", "suture", "--config", "told.yaml"]) == 2
+    assert "advance is 'told'" in capsys.readouterr().err
 
 
 def test_help_and_documentation_have_the_key_table(root, capsys):

@@ -92,7 +92,8 @@ def read_sandboxed(
         try:
             child = subprocess.run(
                 [
-                    *(sys.executable, "-m", "surgicai_vision.demos.imports.sandbox"),
+                    # Without -P, modules of the current folder would be imported and so run.
+                    *(sys.executable, "-P", "-m", "surgicai_vision.demos.imports.sandbox"),
                     *(str(os.getpid()), str(path), str(result), kind, json.dumps(options)),
                 ],
                 env={**os.environ, **ONE_THREAD, "PYTHONPATH": _search_path()},
