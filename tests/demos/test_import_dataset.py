@@ -148,7 +148,7 @@ def test_episodes_that_do_not_show_the_task_are_skipped(demos: list[Demo], tmp_p
 
 
 def test_elements_are_found_by_name_or_order(demos: list[Demo], tmp_path: Path) -> None:
-    """Datasets have short names, an ECM among the names, or no names."""
+    """Datasets have short names, an ECM among the names, names in a table, or no names."""
     rows = rows_of(demos[0], 0)
     short = [
         name.replace("_pose.position.", "_pos_").replace("_pose.orientation.", "_quat_")
@@ -159,6 +159,9 @@ def test_elements_are_found_by_name_or_order(demos: list[Demo], tmp_path: Path) 
         names.STATE: [[*row[8:], 9.0, *row[:8]] for row in rows[names.STATE]],
     }
     own = list(names.ABSOLUTE_STATE_NAMES)
+    other = {**rows, names.STATE: [[*row[8:], *row[:8]] for row in rows[names.STATE]]}
+    turned = [*own[8:], *own[:8]]
+    placed = {name: turned.index(name) for name in own}
     sets = {
         "named": write_dataset(tmp_path / "named", [rows]),
         "short": write_dataset(tmp_path / "short", [rows], state_names=short),
@@ -166,6 +169,8 @@ def test_elements_are_found_by_name_or_order(demos: list[Demo], tmp_path: Path) 
         "ecm": write_dataset(
             tmp_path / "ecm", [swapped], state_names=[[*own[8:], "ecm_pose.position.x", *own[:8]]]
         ),
+        "table": write_dataset(tmp_path / "table", [other], state_names={"motors": turned}),
+        "places": write_dataset(tmp_path / "places", [other], state_names=placed),
     }
     states = []
     for name, path in sets.items():

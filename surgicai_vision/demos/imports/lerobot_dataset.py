@@ -330,10 +330,7 @@ def _whole(table: pa.Table, key: str, where: str) -> NDArray[np.int64]:
 def _elements(path: Path, features: Mapping[str, JSON]) -> dict[str, list[int]]:
     """Return the indices of each arm's eight values in the state."""
     row = features.get(names.STATE)
-    given = row.get("names") if isinstance(row, dict) else None
-    while isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
-        given = given[0]
-    known = [str(name) for name in given] if isinstance(given, list) else []
+    known = _names(row.get("names")) if isinstance(row, dict) else []
     for endings in ELEMENTS:
         found = {arm: [f"{arm}{ending}" for ending in endings] for arm in names.ARMS}
         if all(name in known for arm_names in found.values() for name in arm_names):
@@ -349,6 +346,20 @@ def _elements(path: Path, features: Mapping[str, JSON]) -> dict[str, list[int]]:
         "it must hold the poses and jaws of both arms, "
         f"{', '.join(f'psm1{e}' for e in ELEMENTS[0])} and so on."
     )
+
+
+def _names(given: JSON) -> list[str]:
+    """Return the elements' names in their order; none where a dataset names none.
+
+    They are a list, also one in a list or in a table ({"motors": […]}), or a table of places
+    ({"psm1_jaw": 7}).
+    """
+    if isinstance(given, dict):
+        places = {name: place for name, place in given.items() if isinstance(place, int)}
+        given = list(sorted(places, key=places.__getitem__) or given.values())
+    while isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
+        given = given[0]
+    return [str(name) for name in given] if isinstance(given, list) else []
 
 
 def _matrix(table: pa.Table, key: str, where: str) -> NDArray[np.float64]:
