@@ -25,6 +25,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.core.words import plural
+from surgicai_vision.demos.disturbance import check_told
 from surgicai_vision.teleoperation.keyboard import key_table
 
 app = App(
@@ -145,11 +146,7 @@ def _config(options: Options) -> TaskConfig:
             f"env: action_repeat is {config.action_repeat}; a person moves the arm at every "
             "control step. Leave it out ('export-demos' can hold the actions)."
         )
-    if options.task == names.SUTURE and config.advance == "told":
-        raise InputError(
-            "env: advance is 'told', but nobody tells the env of a session to begin the next "
-            "subtask, so that no episode could succeed. Leave it out."
-        )
+    check_told(config, "a session")
     if options.env and options.env.get("max_steps"):
         if options.seconds is not None:
             raise InputError("--seconds and env: max_steps set the same limit; give only one.")

@@ -153,3 +153,20 @@ def check_returning(demonstrator: str, config: TaskConfig) -> None:
             f"Demonstrator '{demonstrator}' needs an env that advances at each success; advance is "
             f"'{config.advance}'. Leave env.advance out."
         )
+
+
+def check_told(config: TaskConfig, actor: str) -> None:
+    """Refuse an env that waits to be told to begin the next subtask, where nobody tells it.
+
+    Args:
+        config: the task.
+        actor: who acts, as the message says it.
+
+    Raises:
+        InputError: it waits, so that no episode could succeed.
+    """
+    if config.task == names.SUTURE and config.advance == "told":
+        raise InputError(
+            f"advance is 'told', but {actor} tells no env to begin the next subtask, so that no "
+            "episode could succeed; leave env.advance out."
+        )

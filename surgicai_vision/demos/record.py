@@ -50,6 +50,7 @@ from surgicai_vision.demos.disturbance import (
     Disturbance,
     check_late,
     check_returning,
+    check_told,
 )
 from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import (
@@ -190,11 +191,8 @@ def record(
     check_late(demonstrator, disturbance)
     check_returning(demonstrator, config)
     _check_held(config, demonstrator, post_success_steps)
-    if config.task == names.SUTURE and config.advance == "told" and learner is None:
-        raise InputError(
-            f"advance is 'told', but demonstrator '{demonstrator}' tells no env to begin the next "
-            "subtask, so that no episode could succeed; leave env.advance out."
-        )
+    if learner is None:
+        check_told(config, f"demonstrator '{demonstrator}'")
     if disturbance.upset_fraction:
         check_upset_task(config.task)
     # What determines the result: a finished folder of the same request is left as it is. Unused

@@ -158,8 +158,11 @@ def leave_held_grasp(env: "Suture", subtask: int, grasp_hold: int) -> None:
         env.enter(GRASP + 1)
 
 
-def common_images(agents: Sequence[Agent]) -> tuple[tuple[str, ...], int]:
-    """Return the cameras of an env in which all of these agents act, and its image size [px].
+def common_images(agents: Sequence[Agent]) -> tuple[tuple[str, ...], int, bool]:
+    """Return what an env in which all of these agents act shows.
+
+    Returns:
+        Its cameras, the image size [px], and whether it shows depth too.
 
     Raises:
         InputError: an agent gives set-points of both arms, or they see images of several sizes.
@@ -176,7 +179,8 @@ def common_images(agents: Sequence[Agent]) -> tuple[tuple[str, ...], int]:
         )
     seen = {camera for agent in agents for camera in agent.cameras}
     cameras = tuple(camera for camera in camera_names() if camera in seen)
-    return cameras, sizes.pop() if sizes else Agent.image_size
+    size = sizes.pop() if sizes else Agent.image_size
+    return cameras, size, any(agent.depth for agent in agents)
 
 
 @final
@@ -212,8 +216,7 @@ class HierarchicalAgent(Agent):
         )
         self._agents = [*self._low, *([self._high] if self._high else [])]
         self.privileged = not learned or any(agent.privileged for agent in self._agents)
-        self.cameras, self.image_size = common_images(self._agents)
-        self.depth = any(agent.depth for agent in self._agents)
+        self.cameras, self.image_size, self.depth = common_images(self._agents)
         self._slots: dict[int, _EpisodeState] = {}
         self._features: FeatureTable = {}
         for agent in self._agents:

@@ -5,7 +5,6 @@ Interface:
 * `find(folder) -> Path | None`: the folder with config.json and model.safetensors, looked for in a
   training's output, in one of its checkpoints, or in `pretrained_model` itself.
 * `read(folder, task) -> LeRobotCheckpoint`: what the policy was trained for and what it sees.
-* `check_steps(folder)`: refuse processing steps with which LeRobot would run other code.
 * `LeRobotAgent`: the policy as an agent.
 
 A policy with seven action values moves the active arm by increments and sees its pose. One with
@@ -19,13 +18,12 @@ own random numbers, drawn from the episode's seed; a policy that declares itself
 all slots in one batch. Importing LeRobot takes ten seconds and happens only in the worker.
 
 A checkpoint names the steps of that pipeline, and LeRobot calls what it names. Only steps of
-LeRobot and of installed plug-ins are called (`check_steps`).
+LeRobot and of installed plug-ins are called (`lerobot_steps`).
 """
 
 import contextlib
 import copy
 import dataclasses
-import importlib
 import itertools
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,7 +37,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names, check_camera
 from surgicai_vision.core.config import TaskConfig, digest, from_mapping
-from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name, shown
+from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
 from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset import open_h
@@ -51,6 +49,7 @@ from surgicai_vision.evaluation.agent import (
     frame_of,
     simulated,
 )
+from surgicai_vision.evaluation.lerobot_steps import check_steps
 from surgicai_vision.features.devices import (
     cuda_devices,
     random_states,
@@ -69,8 +68,6 @@ if TYPE_CHECKING:
 CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
 PROCESSORS = "policy_*processor*"
 """Files of the processing around a policy: its steps and their normalisers."""
-STEPS = ("policy_preprocessor.json", "policy_postprocessor.json")
-"""Those of them that name the steps."""
 PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")
 """Where a checkpoint may be in a folder that the user names."""
 ENV_TYPE = "surgicai"
@@ -459,10 +456,11 @@ def _load(folder: Path, weights: WeightsSource) -> tuple[LeRobotPolicy, Before, 
     """
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+    from lerobot.processor import ProcessorStep
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
-    check_steps(folder)
+    check_steps(folder, ProcessorStep)
     try:
         config = PreTrainedConfig.from_pretrained(folder)
         # The checkpoint holds the backbone; LeRobot would download it first, only to overwrite it.
@@ -486,35 +484,6 @@ def _load(folder: Path, weights: WeightsSource) -> tuple[LeRobotPolicy, Before, 
             f"LeRobot cannot load {folder} ({(str(error).splitlines() or [''])[0]})."
         ) from error
     return policy.eval(), before, after
-
-
-def check_steps(folder: Path) -> None:
-    """Refuse processing steps that are not classes of LeRobot or of an installed plug-in.
-
-    LeRobot imports and calls a step before it looks at what it is: "subprocess.Popen" runs a
-    program. No other module is imported here.
-
-    Raises:
-        BadFile: a step is something else, or a file that names the steps is damaged or missing.
-    """
-    from lerobot.processor import ProcessorStep
-
-    for path in (folder / name for name in STEPS):
-        steps = checked(_table(path).get("steps"), list, f"{path}: steps")
-        for step in (checked(step, dict, f"{path}: a step") for step in steps):
-            if "registry_name" in step:  # LeRobot looks only there
-                continue
-            named = checked(step.get("class"), str, f"{path}: the class of a step")
-            module, _, name = named.rpartition(".")
-            with contextlib.suppress(ImportError, ValueError):
-                if module.partition(".")[0] == "lerobot":
-                    importlib.import_module(module)
-            kind: object = getattr(sys.modules.get(module), name, None)
-            if not isinstance(kind, type) or not issubclass(kind, ProcessorStep):
-                raise BadFile(
-                    f"{path} is refused: {shown(named)} is no processing step of LeRobot or of an "
-                    "installed plug-in, and LeRobot would call it."
-                )
 
 
 def _encoder(inputs: Inputs, weights: WeightsSource) -> "Encoder":

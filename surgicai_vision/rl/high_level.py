@@ -106,8 +106,8 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
     def __init__(self, config: HierarchicalConfig, task: TaskConfig, low: Sequence[Agent]):
         self.config = config
         self._low = list(low)
-        depth = any(agent.depth for agent in self._low)
-        self._env = cast(Suture, env_showing(task, *common_images(self._low), depth=depth))
+        cameras, image_size, depth = common_images(self._low)
+        self._env = cast(Suture, env_showing(task, cameras, image_size, depth=depth))
         self._observation: Any = None
         self._decisions = 0
         self.control_steps = 0

@@ -30,6 +30,7 @@ from surgicai_vision.core.progress import silent_stage
 from surgicai_vision.dataset import open_dataset, render_demos
 from surgicai_vision.dataset.feature_export import export_features
 from surgicai_vision.demos.record import record
+from surgicai_vision.evaluation.lerobot_steps import check_steps
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.experiments.run import train_run
@@ -662,6 +663,8 @@ def write_steps(folder: Path, **steps: Any) -> Path:
     "named", ["subprocess.Popen", "lerobot.processor.pipeline.json", "a..b", 7]
 )
 def test_a_processing_step_never_runs_a_program(named: object, file: str, tmp_path: Path) -> None:
+    from lerobot.processor import ProcessorStep
+
     from surgicai_vision.evaluation import lerobot_agent
 
     ran = tmp_path / "ran"
@@ -670,10 +673,10 @@ def test_a_processing_step_never_runs_a_program(named: object, file: str, tmp_pa
     with pytest.raises(BadFile, match=r"is refused|must be text"):
         lerobot_agent.LeRobotAgent("act", folder, lerobot_agent.Inputs((), SIZE), "Grasp.")
     assert not ran.exists()
-    lerobot_agent.check_steps(write_steps(tmp_path))
+    check_steps(write_steps(tmp_path), ProcessorStep)
     (folder / f"{file}.json").unlink()
     with pytest.raises(BadFile, match=file):
-        lerobot_agent.check_steps(folder)
+        check_steps(folder, ProcessorStep)
 
 
 # -- LeRobot's tools on our dataset ----------------------------------------------------------------
