@@ -66,13 +66,26 @@ HELDOUT_APPEARANCES = ("liver", "bowel", "scar")
 """Families that no training may see."""
 VARIED_APPEARANCES = tuple(f"varied_{name}" for name in TRAIN_APPEARANCES)
 """The families for training, over cloths and in trays of any colour and of random patterns."""
-APPEARANCES = (*TRAIN_APPEARANCES, *HELDOUT_APPEARANCES, *VARIED_APPEARANCES)
+RANDOM_APPEARANCES = tuple(f"random_{name}" for name in TRAIN_APPEARANCES)
+"""The same, with tissues of any colour, many of random patterns, and any light."""
+APPEARANCES = (
+    *TRAIN_APPEARANCES,
+    *HELDOUT_APPEARANCES,
+    *VARIED_APPEARANCES,
+    *RANDOM_APPEARANCES,
+)
 """Families of looks (`scene.visual.families`). A state holds a family's index here: only append."""
 TRAIN = "train"
 HELDOUT = "heldout"
 VARIED = "varied"
+RANDOM = "random"
 APPEARANCE_SETS = MappingProxyType(
-    {TRAIN: TRAIN_APPEARANCES, VARIED: VARIED_APPEARANCES, HELDOUT: HELDOUT_APPEARANCES}
+    {
+        TRAIN: TRAIN_APPEARANCES,
+        VARIED: VARIED_APPEARANCES,
+        RANDOM: (*VARIED_APPEARANCES, *RANDOM_APPEARANCES),
+        HELDOUT: HELDOUT_APPEARANCES,
+    }
 )
 """Sets of families, as `RandomisationConfig.appearance` names them → their families."""
 

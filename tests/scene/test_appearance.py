@@ -60,7 +60,11 @@ WHITE = (255.0, 255.0, 255.0)
 """A tint that leaves a texture unchanged, hence no colour in its own right."""
 
 
-SHOWN_IN_TRAINING = (*names.TRAIN_APPEARANCES, *names.VARIED_APPEARANCES)
+SHOWN_IN_TRAINING = (
+    *names.TRAIN_APPEARANCES,
+    *names.VARIED_APPEARANCES,
+    *names.RANDOM_APPEARANCES,
+)
 
 
 def test_families_are_those_of_the_names_five_to_train_three_held_out():
@@ -84,6 +88,22 @@ def test_a_varied_family_is_one_for_training_with_other_surroundings():
         assert {part for part in own if own[part] != other[part]} == {
             *("drape", "tray", "tray_finish")
         }
+
+
+def test_a_random_family_keeps_the_needle_and_thread_of_one_for_training():
+    for name, random in zip(names.TRAIN_APPEARANCES, names.RANDOM_APPEARANCES, strict=True):
+        own, other = vars(FAMILIES[name]), vars(FAMILIES[random])
+        assert {part for part in own if own[part] == other[part]} == {
+            *("metal", "needle", "thread")
+        }
+
+
+def test_random_tissues_are_of_any_colour_and_no_two_alike():
+    tissues = [draw_textures(Appearance("random_muscle", seed))["tissue"] for seed in range(60)]
+    means = np.array([tissue.mean(axis=(0, 1)) for tissue in tissues])
+    assert (means.min(axis=0) < 60).all() and (means.max(axis=0) > 180).all()
+    assert set(means.argmax(axis=1)) == {0, 1, 2}
+    assert len({tissue.tobytes() for tissue in tissues}) == len(tissues)
 
 
 def test_random_cloths_are_of_any_colour_and_no_two_alike():
@@ -120,6 +140,7 @@ def test_families_for_training_draw_nothing_of_the_held_out(monkeypatch, source,
             seen(source, model, Appearance(name, seed))
     for seed in range(100):
         draw_textures(Appearance("varied_skin", seed))
+        draw_textures(Appearance("random_skin", seed))
     for name in names.HELDOUT_APPEARANCES:
         with pytest.raises((AssertionError, AttributeError)):
             draw_look(Appearance(name, 0))

@@ -6,7 +6,6 @@ A pattern is a function of (rng, size) that returns a tiling image (height, widt
 import numpy as np
 
 from surgicai_vision.scene.visual.fields import (
-    Colour,
     Image,
     Size,
     cells,
@@ -19,6 +18,7 @@ from surgicai_vision.scene.visual.fields import (
     spots,
     to_bytes,
 )
+from surgicai_vision.scene.visual.random_patterns import any_pattern
 from surgicai_vision.scene.visual.tissues import darker, mixed
 
 CLOTH_SIZE = (256, 256)
@@ -54,38 +54,11 @@ def crepe(rng: np.random.Generator, size: Size = CLOTH_SIZE) -> Image:
 
 
 def varied(rng: np.random.Generator, size: Size = CLOTH_SIZE) -> Image:
-    """Draw one of the cloths above, or a random pattern of random colours.
-
-    The pattern is noise of any fineness, stretched along one axis or not, soft or cut into patches;
-    over it there may be winding lines, spots and creases. Nothing in it is straight or regular.
-    """
+    """Draw one of the cloths above, or a random pattern of random colours."""
     cloth = rng.integers(8)
     if cloth < 3:
         return (woven, fleece, crepe)[cloth](rng, size)
-    first, second, third = (_any_colour(rng) for _ in range(3))
-    rows, columns = (2 ** rng.integers(1, 6, 2)).tolist()
-    share = fractal(rng, size, rows, columns, int(rng.integers(1, 4)))
-    steep = np.float32((1, 2, 4, 16)[rng.integers(4)])
-    share = np.clip(steep * (share - np.float32(0.5)) + np.float32(0.5), 0, 1)
-    image = shaded(share, first, mixed(rng, first, second))
-    rows, columns = rng.integers(3, 20, 2).tolist()
-    if rng.uniform() < 0.6:
-        thread = lines(rng, size, rows, columns, int(rng.integers(3, 6)))
-        image = over(image, third, np.float32(rng.uniform(0.2, 1.0)) * thread)
-    if rng.uniform() < 0.3:
-        image = over(image, second, spots(rng, size, int(rng.integers(5, 60)), 2, 8))
-    if rng.uniform() < 0.5:
-        crease = fractal(rng, size, rows, columns, 2)
-        image = image * (1 + np.float32(rng.uniform(0.2, 0.8)) * relief(crease, 1.6))[..., None]
-    return to_bytes(image)
-
-
-def _any_colour(rng: np.random.Generator) -> Colour:
-    """Draw a colour: a grey of any brightness, with any tint."""
-    grey = rng.uniform(0.0, 255.0)
-    tint = rng.uniform(0.0, 1.0)
-    red, green, blue = (grey + tint * (rng.uniform(0.0, 255.0, 3) - grey)).tolist()
-    return red, green, blue
+    return any_pattern(rng, size)
 
 
 def towel(rng: np.random.Generator, size: Size = CLOTH_SIZE) -> Image:

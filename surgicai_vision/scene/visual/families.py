@@ -1,13 +1,16 @@
 """Families: what belongs together in one appearance, and the bounds within which an episode draws.
 
 `FAMILIES` is the table, in the order of `names.APPEARANCES`. A `varied_` family is one for training
-with random surroundings (`cloths.varied`), of any colour. No pattern, finish, lamp or colour of
-a held-out family is used in a training family (tested in `tests/scene/test_appearance.py`). Colours
-are 0 to 255; they and all bounds were chosen by eye on the contact sheets (`surgicai-vision scene
---looks FILE`), not measured on tissue.
+with random surroundings (`cloths.varied`), of any colour. A `random_` family is the same with a
+random tissue, random instruments and random light. No pattern, finish, lamp or colour of a held-out
+family is used in a training family (tested in `tests/scene/test_appearance.py`), but the random
+colours and lights come close to some of theirs by chance. Colours are 0 to 255; they and all bounds
+were chosen by eye on the contact sheets (`surgicai-vision scene --looks FILE`), not measured on
+tissue.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -17,6 +20,7 @@ import numpy as np
 from surgicai_vision.core import names
 from surgicai_vision.scene.visual import cloths, tissues
 from surgicai_vision.scene.visual.fields import Colour, Image, Size
+from surgicai_vision.scene.visual.random_patterns import any_tissue
 
 Bounds = tuple[float, float]
 Pattern = Callable[[np.random.Generator, Size], Image]
@@ -328,14 +332,61 @@ _DRAWN: Mapping[str, Family] = MappingProxyType(
 ANY_TRAY = Finish((255.0, 255.0, 255.0), (235.0, 235.0, 235.0), (0.1, 0.7), (0.2, 0.7))
 """A tray whose texture has its colour."""
 
+ANY_WET = Finish((255.0, 255.0, 255.0), (255.0, 240.0, 232.0), (0.05, 1.0), (0.1, 0.95))
+"""A skin of any wetness whose texture has its colour."""
+ANY_FLESH = Finish((232.0, 204.0, 184.0), (62.0, 24.0, 26.0))
+ANY_INSIDE = Finish((116.0, 52.0, 46.0), (28.0, 6.0, 12.0))
+ANY_INK = Finish((34.0, 26.0, 60.0), (12.0, 20.0, 18.0))
+"""Darker than any random tissue."""
+ANY_STEEL = Finish((196.0, 196.0, 200.0), (84.0, 82.0, 88.0), (0.1, 1.0), (0.1, 0.9))
+ANY_JAW = Finish((128.0, 126.0, 130.0), (44.0, 44.0, 48.0), (0.1, 0.9), (0.1, 0.9))
+ANY_SHAFT = Finish((146.0, 146.0, 146.0), (24.0, 24.0, 28.0), (0.2, 0.8), (0.2, 0.8))
+ANY_LAMPS = Lamps(
+    (255.0, 206.0, 150.0),
+    (196.0, 232.0, 255.0),
+    ambient=(0.12, 0.40),
+    head=(0.08, 0.30),
+    key=(0.02, 0.70),
+    lean=1.2,
+    fill=(0.0, 0.30),
+    spot=(0.0, 0.90),
+    cutoff=(36.0, 55.0),
+    exponent=(2.0, 24.0),
+    glare=(0.1, 1.1),
+)
+"""The rest of a random look. Needle and thread stay those of the family."""
+
+
+def _with_any_surroundings(family: Family) -> Family:
+    """Return a family over a random cloth and in a random tray."""
+    return dataclasses.replace(
+        family, drape=cloths.varied, tray=cloths.varied, tray_finish=ANY_TRAY
+    )
+
+
+def _with_anything(family: Family) -> Family:
+    """Return a family with random surroundings, tissue, instruments and light."""
+    return dataclasses.replace(
+        _with_any_surroundings(family),
+        tissue=functools.partial(any_tissue, family.tissue),
+        wet=ANY_WET,
+        flesh=ANY_FLESH,
+        inside=ANY_INSIDE,
+        ink=ANY_INK,
+        steel=ANY_STEEL,
+        jaw=ANY_JAW,
+        shaft=ANY_SHAFT,
+        lamps=ANY_LAMPS,
+    )
+
+
+_TRAINED = tuple(_DRAWN[name] for name in names.TRAIN_APPEARANCES)
 FAMILIES: Mapping[str, Family] = MappingProxyType(
     {
         **_DRAWN,
-        **{
-            varied: dataclasses.replace(
-                _DRAWN[name], drape=cloths.varied, tray=cloths.varied, tray_finish=ANY_TRAY
-            )
-            for varied, name in zip(names.VARIED_APPEARANCES, names.TRAIN_APPEARANCES, strict=True)
-        },
+        **dict(
+            zip(names.VARIED_APPEARANCES, map(_with_any_surroundings, _TRAINED), strict=True)
+        ),
+        **dict(zip(names.RANDOM_APPEARANCES, map(_with_anything, _TRAINED), strict=True)),
     }
 )
