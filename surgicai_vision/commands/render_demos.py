@@ -56,7 +56,7 @@ class Options:
         depth: Also render depth.
         segmentation: Also render a segmentation into parts.
         frame_stride: Render only every N-th frame, which costs less time and space per episode.
-        appearance: Looks to draw instead of the recorded ones: train, varied, heldout, or a family.
+        appearance: Looks to draw instead of the recorded ones: a set of families, or a family.
         distractors: Largest number of distractor objects, drawn with the look.
         variants: Number of looks in which to render each demonstration.
         corruption: Largest strength of smoke, blur and pixel noise, each drawn with the look.

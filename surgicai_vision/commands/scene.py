@@ -65,7 +65,7 @@ class Options:
         animation: Instead of the sheet, the expert's episode as an animation, in the first view.
         axes: Instead of the sheet, every axis of `robustness` at every strength, in the first view.
         looks: Instead of the sheet, a row per family of looks: every view at seeds from --seed on.
-        appearance: Families shown by --looks: all, train, varied, heldout, plain, or their names.
+        appearance: Families shown by --looks: all, plain, a set of families, or their names.
         draws: Number of seeds shown by --looks.
         distractors: Largest number of distractor objects in --looks, 0 to 5.
         needles: Instead of the sheet, every needle that randomisation can draw, in the first view.

@@ -222,9 +222,10 @@ class RandomisationConfig:
             "train" draws one to train on, a third (in two of three episodes) or a half, "heldout"
             the one that is kept for tests; "" takes the scene's, a third.
         appearance: "train" draws one of the five families of looks for training, "varied" one of
-            the same with random surroundings, "heldout" one of those kept for tests, a family's
-            name takes that one; within it every episode has its own look. "" takes the plain look.
-            See docs/looks.md.
+            the same with random surroundings, "random" one of these or the same with random tissue,
+            instruments and light as well, "heldout" one of those kept for tests, a family's name
+            takes that one; within it every episode has its own look. "" takes the plain look. See
+            docs/looks.md.
         distractors: largest number of distractor objects, 0 to 5: a second needle, gauze, a clip,
             cut thread, blood. Each episode draws how many. They are visual only.
         appearance_shift: how far each episode's look is shifted towards one of a held-out family,

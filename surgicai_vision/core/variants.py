@@ -22,8 +22,8 @@ class Variants:
     """The looks in which each demonstration is rendered.
 
     Attributes:
-        appearance: as in `RandomisationConfig`: a family, "train" or "heldout"; "" keeps the
-            recorded look.
+        appearance: as in `RandomisationConfig`: a family or a set of families ("train"); "" keeps
+            the recorded look.
         distractors: as in `RandomisationConfig`: largest number of distractor objects; 0 keeps what
             was recorded.
         count: variants of each demonstration.

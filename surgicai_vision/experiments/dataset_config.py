@@ -47,8 +47,8 @@ class Demonstrations:
             the one policies are evaluated in.
         visits_of: name of demonstrations of the whole procedure, whose visits of this task
             (`demos.cut`) are rendered with these.
-        appearance: the looks they are rendered in (`core.variants`), "train", "varied" or one of
-            their families; "" renders each as it was recorded.
+        appearance: the looks they are rendered in (`core.variants`), "train", "varied", "random" or
+            one of their families; "" renders each as it was recorded.
         distractors: most distractors in the rendered scene; 0 leaves those that were recorded.
         variants: in how many looks each demonstration is rendered.
         corruption: largest strength of smoke, blur and pixel noise on the rendered images.

@@ -384,9 +384,7 @@ _TRAINED = tuple(_DRAWN[name] for name in names.TRAIN_APPEARANCES)
 FAMILIES: Mapping[str, Family] = MappingProxyType(
     {
         **_DRAWN,
-        **dict(
-            zip(names.VARIED_APPEARANCES, map(_with_any_surroundings, _TRAINED), strict=True)
-        ),
+        **dict(zip(names.VARIED_APPEARANCES, map(_with_any_surroundings, _TRAINED), strict=True)),
         **dict(zip(names.RANDOM_APPEARANCES, map(_with_anything, _TRAINED), strict=True)),
     }
 )
