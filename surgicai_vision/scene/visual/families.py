@@ -11,19 +11,16 @@ tissue.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-import numpy as np
-
 from surgicai_vision.core import names
 from surgicai_vision.scene.visual import cloths, tissues
-from surgicai_vision.scene.visual.fields import Colour, Image, Size
+from surgicai_vision.scene.visual.fields import Colour, Pattern
 from surgicai_vision.scene.visual.random_patterns import any_tissue
 
 Bounds = tuple[float, float]
-Pattern = Callable[[np.random.Generator, Size], Image]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ A sine or an exponential differs between processors.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ Image = NDArray[np.uint8]
 Field = NDArray[np.float32 | np.float64]
 Size = tuple[int, int]
 """Height and width [pixel]."""
+Pattern = Callable[[np.random.Generator, Size], Image]
+"""What draws a texture."""
 Colour = tuple[float, float, float]
 """Red, green, blue, each 0 to 255."""
 

@@ -5,13 +5,12 @@ families draw what no real surface looks like (docs/looks.md). Nothing in these 
 or regular, as the stripe and the check of two held-out cloths are.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
 from surgicai_vision.scene.visual.fields import (
     Colour,
     Image,
+    Pattern,
     Size,
     fractal,
     lines,
@@ -62,16 +61,12 @@ def any_colour(rng: np.random.Generator) -> Colour:
     return red, green, blue
 
 
-def any_tissue(
-    pattern: Callable[[np.random.Generator, Size], Image],
-    rng: np.random.Generator,
-    size: Size = TISSUE_SIZE,
-) -> Image:
+def any_tissue(pattern: Pattern, rng: np.random.Generator, size: Size = TISSUE_SIZE) -> Image:
     """Draw a tissue's pattern, or a random one in its place, in a random colour and contrast."""
     drawn = (pattern if rng.uniform() < KEPT else any_pattern)(rng, size)
     # A sum of integers is exact, so that every machine finds the same mean.
     mean = drawn.reshape(-1, 3).sum(axis=0, dtype=np.int64) / (size[0] * size[1])
-    colour = np.array(any_colour(rng)) + 1.0
+    colour = np.array(any_colour(rng)) + 1.0  # black has no direction to be scaled along
     colour *= rng.uniform(*BRIGHTEST) / colour.max()
     contrast = rng.uniform(0.5, 1.5)
     image = colour + contrast * (colour.max() / max(mean.max(), 1.0)) * (drawn - mean)
