@@ -65,8 +65,9 @@ BLOCKED = 0.001
 ridge's steep flank."""
 WAYPOINTS = (0.2, 0.4, 0.6, 0.8, 1.0)
 """Shares of a straight path at which its joints are checked."""
-HANDOFF_OFFSET = math.radians(4.0)
-"""The expert grasps the needle a little nearer to the tip than the goal, away from the tissue."""
+HANDOFF_ROOM = 0.0008
+"""A handoff's tool that is off by up to this much along the needle [m] is lined up: in some worlds
+PSM1's wrist touches the phantom before the jaws are at the goal, of which 2 mm are tolerated."""
 
 
 class ToolTarget(NamedTuple):
@@ -253,7 +254,9 @@ def _shifted(pose: Matrix, shift: Matrix) -> Matrix:
 # -- grasping the needle ---------------------------------------------------------------------------
 
 
-def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: float) -> ToolTarget:
+def approach_and_grasp(
+    world: WorldState, goal: Matrix, back: float, opened: float, room: float = 0.0
+) -> ToolTarget:
     """Line up before the grasp with open jaws, move in, close.
 
     Args:
@@ -261,12 +264,11 @@ def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: flo
         goal: T_world_tip of the grasp.
         back: how far before the grasp the tool lines up [m].
         opened: jaw angle on the way [rad].
+        room: how far the tool may be off along the needle [m].
     """
-    # Where the tool is relative to the grasp, along and across the approach axis.
-    axis = goal[:3, 2]
-    offset = world.tip[:3, 3] - goal[:3, 3]
-    depth = float(offset @ axis)
-    beside = float(np.linalg.norm(offset - depth * axis))
+    # Where the tool is relative to the grasp, in its axes: along the needle, across it, ahead.
+    along, across, depth = (goal[:3, :3].T @ (world.tip[:3, 3] - goal[:3, 3])).tolist()
+    beside = math.hypot(max(0.0, abs(along) - room), across)
     turned = angle_between(world.tip, goal)
     lined_up = beside < 2 * ALIGNED and turned < 2 * ALIGNED_ANGLE
     closing = world.command_jaw < opened - 2 * world.step.jaw
@@ -277,7 +279,7 @@ def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: flo
         return ToolTarget(goal, 0.0)
     if lined_up and not closing:
         return ToolTarget(goal, opened)
-    return ToolTarget(_shifted(goal, -back * axis), opened)
+    return ToolTarget(_shifted(goal, -back * goal[:3, 2]), opened)
 
 
 def _grasp(world: WorldState) -> ToolTarget:
@@ -289,9 +291,9 @@ def _grasp(world: WorldState) -> ToolTarget:
 
 def _handoff(world: WorldState) -> ToolTarget:
     goal = world.needle @ grasp_in_needle(
-        world.arm, world.stitch.handoff_angle + HANDOFF_OFFSET, radius=world.stitch.radius
+        world.arm, world.stitch.handoff_angle, radius=world.stitch.radius
     )
-    return approach_and_grasp(world, goal, HANDOFF_BACK, OPEN_HANDOFF)
+    return approach_and_grasp(world, goal, HANDOFF_BACK, OPEN_HANDOFF, HANDOFF_ROOM)
 
 
 # -- carrying the needle ---------------------------------------------------------------------------
