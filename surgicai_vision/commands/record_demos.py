@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import App, Parameter, validators
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
@@ -26,9 +26,12 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.percentages import interval
 from surgicai_vision.core.words import plural
 from surgicai_vision.demos.demonstrator import CHOOSING_DEMONSTRATORS, SOURCES
+from surgicai_vision.demos.disturbance import MOST_AIM_NOISE
 
 if TYPE_CHECKING:
     from surgicai_vision.demos.record import Learner
+
+MILLIMETRES = Parameter(validator=validators.Number(gte=0, lte=MOST_AIM_NOISE), metavar="MM")
 
 app = App(
     name="record-demos",
@@ -58,6 +61,8 @@ class Options:
             and --noise.
         jaw_noise: Standard deviation of the noise on the jaw's motion while it is not commanded to
             close.
+        aim_noise: Standard deviation of how far past the grasp the tool aims, along the needle, in
+            half of all periods of 25 control steps [mm] (grasp and handoff); labels stay right.
         perturb_start_fraction: Share of episodes that start with an unrecorded random motion.
         upset_fraction: Share of episodes in which something goes wrong once: the needle is pushed,
             or jaws open (docs/demos.md).
@@ -82,6 +87,7 @@ class Options:
         float | None, FRACTION, Parameter(metavar="SIGMA"), default_text("the value of --noise")
     ] = None
     jaw_noise: Annotated[float, FRACTION, Parameter(metavar="SIGMA")] = 0.0
+    aim_noise: Annotated[float, MILLIMETRES] = 0.0
     perturb_start_fraction: Annotated[float, FRACTION] = 0.0
     upset_fraction: Annotated[float, FRACTION] = 0.0
     late: Annotated[int, NOT_NEGATIVE] = 0
@@ -127,6 +133,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             options.upset_fraction,
             options.late,
             options.jaw_noise,
+            options.aim_noise,
         ),
         post_success_steps=options.post_success_steps,
         demos=demos,

@@ -51,6 +51,15 @@ class Demonstrator(ABC):
     def action(self) -> NDArray[np.float32]:
         """Return the action for the env's present state, (7,) in [-1, 1]."""
 
+    def missing(self, shift: float) -> NDArray[np.float32]:
+        """Return the action with which a grasp would miss, (7,) in [-1, 1].
+
+        Args:
+            shift: how far past the grasp it aims, along the needle towards its tip [m]. A
+                demonstrator that cannot miss (`AIMING_DEMONSTRATORS`) ignores it.
+        """
+        return self.action()
+
 
 class BehaviourPolicy(ABC):
     """Acts instead of the demonstrator at first; the labels remain the demonstrator's."""

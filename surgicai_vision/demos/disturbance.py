@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import CLOCK_PERIOD, TaskConfig
 from surgicai_vision.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 
 PERTURBATION_STEPS = (8, 25)
 """Fewest and most control steps of a perturbation: 4 to 12 mm at the paper's step size."""
+AIM_STEPS = CLOCK_PERIOD
+"""Control steps for which a tool aims past the grasp: one attempt of `demos.search_expert`."""
+AIM_SHARE = 0.5
+"""Share of these periods in which it does; in the others it aims right."""
+MOST_AIM_NOISE = 5.0
+"""Largest standard deviation of the aim [mm]; the needle's arc is 21 mm long."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,11 @@ class Disturbance:
             Without this noise, open jaws are always exactly as open as the demonstrator holds them,
             and a policy never sees how to reopen jaws that have closed a little
             (docs/results/unmoved.md).
+        aim_noise: standard deviation of how far past the grasp, along the needle, the executed
+            motions aim [mm]. It is drawn anew every `AIM_STEPS`, and in `AIM_SHARE` of them. Noise
+            of single steps is corrected at once, so that it shows no state that is off by more than
+            0.5 mm; a policy that is, and was shown none, repeats the demonstrated motion from
+            there (docs/results/unmoved.md). The jaw follows the label.
         late: the most control steps by which a demonstrator that goes back notices a loss late;
             each episode draws its own. It shows the behaviour of a policy that has not noticed yet.
     """
@@ -47,6 +58,7 @@ class Disturbance:
     upset_fraction: float = 0.0
     late: int = 0
     jaw_noise: float = 0.0
+    aim_noise: float = 0.0
 
     def __post_init__(self) -> None:
         if self.noise_from is not None and not 0.0 <= self.noise_from <= self.noise:
@@ -60,11 +72,14 @@ class Disturbance:
             )
         if not 0.0 <= self.jaw_noise <= 1.0:
             raise InputError(f"jaw_noise is {self.jaw_noise:g}; it must be within 0 and 1.")
+        if not 0.0 <= self.aim_noise <= MOST_AIM_NOISE:
+            raise InputError(
+                f"aim_noise is {self.aim_noise:g} mm; it must be within 0 and {MOST_AIM_NOISE:g}."
+            )
         if not 0.0 <= self.upset_fraction <= 1.0:
             raise InputError(
                 f"upset_fraction is {self.upset_fraction:g}; it must be within 0 and 1."
             )
-
         if self.late < 0:
             raise InputError(f"late is {self.late}; it must be at least 0 control steps.")
 
@@ -93,6 +108,11 @@ class Disturbance:
             return self.noise
         return float(rng.uniform(self.noise_from, self.noise))
 
+    def draw_aim(self, rng: np.random.Generator) -> float:
+        """Return how far past the grasp the motions of the next `AIM_STEPS` aim [m]."""
+        shift = float(rng.normal(0.0, self.aim_noise * 1e-3))
+        return shift if rng.random() < AIM_SHARE else 0.0
+
     def draw_late(self, rng: np.random.Generator) -> int:
         """Return by how many control steps an episode's demonstrator notices a loss late."""
         return int(rng.integers(0, self.late, endpoint=True)) if self.late else 0
@@ -116,6 +136,11 @@ class Disturbance:
 
 UNDISTURBED = Disturbance()
 
+AIMING_DEMONSTRATORS = ("expert", "search")
+"""Those that can aim past the grasp (`Demonstrator.missing`)."""
+AIMING_TASKS = ("grasp", "handoff", names.SUTURE)
+"""The tasks in which a needle is grasped."""
+
 RETURNING_DEMONSTRATORS = ("recover",)
 """Those that go back after a loss, and so can notice it late."""
 
@@ -131,6 +156,27 @@ def check_late(demonstrator: str, disturbance: Disturbance) -> None:
             f"late is {disturbance.late}, but demonstrator '{demonstrator}' never goes back to "
             "an earlier subtask; leave late out or use demonstrator "
             f"{', '.join(RETURNING_DEMONSTRATORS)}."
+        )
+
+
+def check_aim(demonstrator: str, task: str, disturbance: Disturbance) -> None:
+    """Refuse `aim_noise` where nothing is grasped, or by a demonstrator that cannot miss.
+
+    Raises:
+        InputError: it is set for such a task or demonstrator.
+    """
+    if not disturbance.aim_noise:
+        return
+    if task not in AIMING_TASKS:
+        raise InputError(
+            f"aim_noise is {disturbance.aim_noise:g}, but task '{task}' grasps nothing; leave it "
+            f"out or use task {', '.join(AIMING_TASKS)}."
+        )
+    if demonstrator not in AIMING_DEMONSTRATORS:
+        raise InputError(
+            f"aim_noise is {disturbance.aim_noise:g}, but demonstrator '{demonstrator}' cannot "
+            f"aim past the grasp; leave it out or use demonstrator "
+            f"{', '.join(AIMING_DEMONSTRATORS)}."
         )
 
 

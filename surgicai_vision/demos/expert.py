@@ -117,7 +117,11 @@ class Expert(Demonstrator):
 
     def label(self) -> NDArray[np.float32]:
         """Return the action without noise: the label of the present state, (7,)."""
-        world = WorldState(self.env)
+        return self.missing(0.0)
+
+    def missing(self, shift: float) -> NDArray[np.float32]:
+        """Return the label, (7,), were the goal of a grasp `shift` further along the needle [m]."""
+        world = WorldState(self.env, shift)
         return action_towards(world, _rule(self.env.subtask)(world))
 
 
@@ -137,12 +141,15 @@ class WorldState:
         command: T_world_tip that this command really means.
         command_jaw: commanded jaw angle [rad].
         holds: whether the active arm's jaws hold the needle.
+        miss: angle of the needle by which a grasp aims past its goal [rad]; 0 unless it should
+            miss.
     """
 
-    def __init__(self, env: SuturingEnv):
+    def __init__(self, env: SuturingEnv, shift: float = 0.0):
         simulation = env.simulation
         self.arm = env.subtask.arm
         self.stitch: Stitch = env.stitch
+        self.miss = shift / self.stitch.radius
         self.task_state = simulation.task_state
         self.step = StepSize.of(env.config.step)
         self.base = poses.square(simulation.bases[self.arm])
@@ -284,14 +291,14 @@ def approach_and_grasp(
 
 def _grasp(world: WorldState) -> ToolTarget:
     goal = world.needle @ grasp_in_needle(
-        world.arm, world.task_state.grasp_angle, radius=world.stitch.radius
+        world.arm, world.task_state.grasp_angle + world.miss, radius=world.stitch.radius
     )
     return approach_and_grasp(world, goal, HOVER, OPEN_ABOVE)
 
 
 def _handoff(world: WorldState) -> ToolTarget:
     goal = world.needle @ grasp_in_needle(
-        world.arm, world.stitch.handoff_angle, radius=world.stitch.radius
+        world.arm, world.stitch.handoff_angle + world.miss, radius=world.stitch.radius
     )
     return approach_and_grasp(world, goal, HANDOFF_BACK, OPEN_HANDOFF, HANDOFF_ROOM)
 

@@ -48,6 +48,7 @@ from surgicai_vision.demos.demonstrator import (
 from surgicai_vision.demos.disturbance import (
     UNDISTURBED,
     Disturbance,
+    check_aim,
     check_late,
     check_returning,
     check_told,
@@ -111,6 +112,7 @@ def record_into(
     upset_fraction: float = 0.0,
     late: int = 0,
     jaw_noise: float = 0.0,
+    aim_noise: float = 0.0,
     post_success_steps: int = 0,
     demos: Sequence[str] = (),
     source: str = "",
@@ -123,7 +125,15 @@ def record_into(
             make_demonstrator(demonstrator, env, demos, source),
             seed,
             demonstrator,
-            Disturbance(noise, perturb_start_fraction, noise_from, upset_fraction, late, jaw_noise),
+            Disturbance(
+                noise,
+                perturb_start_fraction,
+                noise_from,
+                upset_fraction,
+                late,
+                jaw_noise,
+                aim_noise,
+            ),
             post_success_steps,
             behaviour,
         )
@@ -174,9 +184,10 @@ def record(
         InputError: fewer than one episode, a negative seed or post_success_steps, starts that
             are reserved for validation or tests, an unknown demonstrator, demonstrations for a
             demonstrator that does not learn from any, none for one that does, a source for one
-            that chooses no demonstration, upsets in a task that has none, held actions
-            (`action_repeat`) in demonstrations that go on after their success, or a whole
-            procedure that goes on only when told to.
+            that chooses no demonstration, upsets in a task that has none, `aim_noise` where nothing
+            is grasped or by a demonstrator that cannot miss, held actions (`action_repeat`) in
+            demonstrations that go on after their success, or a whole procedure that goes on only
+            when told to.
         OutputExists: `out` holds something else.
         SurgicaiError: the demonstrator failed at too many seeds.
     """
@@ -189,6 +200,7 @@ def record(
     check_training_starts(seed, episodes)
     _check_demos(demonstrator, demos, source)
     check_late(demonstrator, disturbance)
+    check_aim(demonstrator, config.task, disturbance)
     check_returning(demonstrator, config)
     _check_held(config, demonstrator, post_success_steps)
     if learner is None:

@@ -3,11 +3,11 @@
     result = rollout(env, expert, seed)      # one episode, kept or not
 
 With a `Disturbance` the demonstrator meets states off its own path. There is noise on what is
-executed, while the label remains its own answer (DART, Laskey et al. 2017), and starts are
-perturbed before the recording begins. With a `BehaviourPolicy` these are the states that a learner
-itself reaches (DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`). With upsets
-(`envs.upset`) something goes wrong once, and a demonstrator that can (`demos.recovery_expert`) goes
-back to correct it.
+executed, while the label remains its own answer (DART, Laskey et al. 2017), the tool aims past the
+grasp for a while, and starts are perturbed before the recording begins. With a `BehaviourPolicy`
+these are the states that a learner itself reaches (DAgger, Ross et al. 2011;
+`surgicai_vision.experiments.dagger`). With upsets (`envs.upset`) something goes wrong once, and a
+demonstrator that can (`demos.recovery_expert`) goes back to correct it.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.files import code_version
 from surgicai_vision.demos.demonstrator import BehaviourPolicy, Demonstrator
-from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance
+from surgicai_vision.demos.disturbance import AIM_STEPS, UNDISTURBED, Disturbance
 from surgicai_vision.demos.store import Demo
 from surgicai_vision.envs.upset import Upset, plan_upset
 
@@ -156,7 +156,8 @@ def rollout(
     if not disturbance.perturb_start(env, rng):
         env.reset(seed=seed)  # the perturbation ended the episode; this start is left unperturbed
     deviation = disturbance.draw_deviation(rng)
-    is_noisy = bool(disturbance.noise or disturbance.jaw_noise)
+    is_noisy = bool(disturbance.noise or disturbance.jaw_noise or disturbance.aim_noise)
+    shift = 0.0
     demonstrator.late = disturbance.draw_late(rng)
     observation = env.observe() if behaviour else None
     if behaviour:
@@ -175,11 +176,15 @@ def rollout(
         if is_pushed or env.phase != phase:
             recorder.restate()
             observation = env.observe() if behaviour else None
+        if disturbance.aim_noise and len(recorder) % AIM_STEPS == 0:
+            shift = disturbance.draw_aim(rng)
         executed = None
         if behaviour and observation is not None:
             executed = behaviour.action(env, observation)
         if executed is None:
-            executed = disturbance.disturb(label, deviation, rng) if is_noisy else label
+            # The jaw follows the label: a tool that aims past the grasp does not close there.
+            acted = np.append(demonstrator.missing(shift)[:6], label[6]) if shift else label
+            executed = disturbance.disturb(acted, deviation, rng) if is_noisy else label
         recorder.step(upset.altered(executed), label)
         observation = recorder.observation
         if succeeded:

@@ -65,9 +65,13 @@ class SearchExpert(Demonstrator):
 
     def action(self) -> NDArray[np.float32]:
         """Return the next action for the env's present state, (7,) in [-1, 1]."""
+        return self.missing(0.0)
+
+    def missing(self, shift: float) -> NDArray[np.float32]:
+        """Return the action, (7,), were every attempt `shift` further along the needle [m]."""
         if self.env.subtask.name != "grasp":
-            return self._expert.action()
-        world = WorldState(self.env)
+            return self._expert.missing(shift)
+        world = WorldState(self.env, shift)
         return action_towards(world, self._target(world, self.env.simulation.task_state.steps))
 
     def _target(self, world: WorldState, step: int) -> ToolTarget:
@@ -77,7 +81,7 @@ class SearchExpert(Demonstrator):
         if attempt and steps_into_period < self.OPENING_STEPS:
             return ToolTarget(world.command, self.OPEN_JAW)
         moved = world.stitch.grasps(*GRASP_ANGLES)[0] - GRASP_ANGLES[0]
-        angle = moved + math.radians(self.ATTEMPTS[attempt])
+        angle = moved + math.radians(self.ATTEMPTS[attempt]) + world.miss
         goal = world.needle @ grasp_in_needle(world.arm, angle, radius=world.stitch.radius)
         if attempt:
             return approach_and_grasp(world, goal, 0.0, self.OPEN_JAW)

@@ -13,7 +13,7 @@ from surgicai_vision.core.config import JSON, LATER, TaskConfig, check_frame_str
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.core.variants import Variants
 from surgicai_vision.demos.demonstrator import CHOOSING_DEMONSTRATORS, SCRIPTED_DEMONSTRATORS
-from surgicai_vision.demos.disturbance import Disturbance, check_late
+from surgicai_vision.demos.disturbance import Disturbance, check_aim, check_late
 
 SEEDS_EACH = 20_000
 """Start seeds that belong to one training seed."""
@@ -39,6 +39,7 @@ class Demonstrations:
         demonstrator: who demonstrates.
         noise: noise on the actions that the demonstrator executes (`Disturbance`).
         jaw_noise: noise on the jaw's motion while it is not told to close.
+        aim_noise: how far past the grasp the tool aims now and then [mm].
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
         late: largest delay [control steps] with which a demonstrator that goes back notices a loss.
         post_success_steps: control steps an episode goes on after its success.
@@ -84,10 +85,12 @@ class Demonstrations:
     corruption: float = field(default=0.0, metadata=LATER)
     learner: str = field(default="", metadata=LATER)
     jaw_noise: float = field(default=0.0, metadata=LATER)
+    aim_noise: float = field(default=0.0, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_name("demonstrator", self.demonstrator, DEMONSTRATORS)
         check_late(self.demonstrator, self.disturbance)
+        check_aim(self.demonstrator, self.task, self.disturbance)
         check_frame_stride(self.frame_stride)
         check_at_least(1, **{f"demonstrations {self.name}: episodes": self.episodes})
         check_at_least(0, post_success_steps=self.post_success_steps)
@@ -124,6 +127,7 @@ class Demonstrations:
             upset_fraction=self.upset_fraction,
             late=self.late,
             jaw_noise=self.jaw_noise,
+            aim_noise=self.aim_noise,
         )
 
     @property
@@ -134,6 +138,7 @@ class Demonstrations:
         parts = [who]
         parts += [f"executed with noise {self.noise:g}"] if self.noise else []
         parts += [f"its open jaws with noise {self.jaw_noise:g}"] if self.jaw_noise else []
+        parts += [f"aiming past the grasp by {self.aim_noise:g} mm"] if self.aim_noise else []
         parts += [f"upset in {self.upset_fraction:.0%}"] if self.upset_fraction else []
         parts += [f"noticed up to {self.late} steps late"] if self.late else []
         parts += [f"going on for {after} steps after their success"] if after else []
