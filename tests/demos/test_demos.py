@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from fake_env import FakeEnv, FakeExpert
 from shown import showing
 
+from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import (
@@ -22,9 +24,11 @@ from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.files import write_json
 from surgicai_vision.demos import record as recording
 from surgicai_vision.demos import store
-from surgicai_vision.demos.disturbance import Disturbance
+from surgicai_vision.demos.disturbance import AIM_STEPS, Disturbance
+from surgicai_vision.demos.expert import Expert, WorldState
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.rollout import rollout
+from surgicai_vision.demos.search_expert import SearchExpert
 from surgicai_vision.demos.store import (
     Demo,
     list_demos,
@@ -33,6 +37,8 @@ from surgicai_vision.demos.store import (
     write_demo,
     write_marker,
 )
+from surgicai_vision.envs.geometry import grasp_in_needle
+from surgicai_vision.scene import needle
 
 CONFIG = TaskConfig(max_steps=12)
 
@@ -130,6 +136,60 @@ def test_open_jaws_have_noise_of_their_own_and_closing_ones_none(tmp_path):
     assert "jaw_noise" not in stored[0] and stored[1]["jaw_noise"] == 1
 
 
+def played(demo: Demo) -> np.ndarray:
+    """Return how far the tool is past an attempt's aim at the end of each period [m]."""
+    env = envs.make(demo.config)
+    env.reset(seed=demo.seed)
+    past = []
+    for attempt, step in enumerate(range(99, len(demo), AIM_STEPS)):
+        env.set_state_vector(demo.state[step])
+        world = WorldState(env)
+        aim = math.radians(SearchExpert.ATTEMPTS[attempt])
+        goal = world.needle @ grasp_in_needle(world.arm, aim)
+        past.append((world.tip - goal)[:3, 3] @ world.needle[:3, :3] @ needle.tangent(aim))
+    return np.array(past)
+
+
+def test_a_tool_that_aims_past_the_grasp_is_shown_the_way_back():
+    """Noise of single steps leaves a tool near its aim; a missed aim does not, in some periods."""
+    env = envs.make(TaskConfig("grasp"))
+    disturbances = (Disturbance(0.3), Disturbance(0.3, aim_noise=2.0))
+    calm, missing = (
+        rollout(env, SearchExpert(env), 7, "search", disturbance).demo
+        for disturbance in disturbances
+    )
+    assert np.abs(played(calm)).max() < 0.0007
+    assert np.abs(played(missing)).max() > 0.0015 > 0.0007 > np.abs(played(missing)).min()
+
+
+@pytest.mark.parametrize(("task", "demonstrator"), [("grasp", SearchExpert), ("handoff", Expert)])
+def test_labels_and_jaws_stay_right_where_the_tool_misses(task, demonstrator):
+    env = envs.make(TaskConfig(task))
+    demo = rollout(env, demonstrator(env), 7, disturbance=Disturbance(aim_noise=2.0)).demo
+    missed = np.abs(demo.executed[:, :6] - demo.action[:, :6]).max(axis=1) > 0.01
+    assert AIM_STEPS / 2 <= missed.sum() < len(demo) - AIM_STEPS / 2
+    np.testing.assert_array_equal(demo.executed[:, 6], demo.action[:, 6])
+    for step in range(0, len(demo), 7):
+        env.set_state_vector(demo.state[step])
+        np.testing.assert_array_equal(demonstrator(env).action(), demo.action[step])
+
+
+def test_where_nothing_is_grasped_no_tool_misses(tmp_path):
+    for task, demonstrator, told in (
+        ("place", "expert", "grasps nothing"),
+        ("suture", "recover", "'recover' cannot aim past"),
+    ):
+        with pytest.raises(InputError, match=told):
+            record(
+                TaskConfig(task),
+                episodes=1,
+                out=tmp_path / task,
+                demonstrator=demonstrator,
+                disturbance=Disturbance(aim_noise=1.0),
+            )
+        assert not (tmp_path / task).exists()
+
+
 def test_an_episode_goes_on_after_its_success():
     env = FakeEnv(CONFIG)
     plain = rollout(env, FakeExpert(env), 3).demo
@@ -187,6 +247,8 @@ def test_a_recovery_starts_elsewhere_and_its_push_is_not_recorded():
         {"perturb_start_fraction": 1.1},
         {"jaw_noise": 1.1},
         {"jaw_noise": float("nan")},
+        {"aim_noise": 5.1},
+        {"aim_noise": float("nan")},
         {"noise_from": 0.1},
     ],
 )

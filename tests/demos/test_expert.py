@@ -7,7 +7,7 @@ import pytest
 from episodes import actions, make, play
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import SceneConfig
+from surgicai_vision.core.config import RandomisationConfig, SceneConfig
 from surgicai_vision.demos.expert import Expert
 
 JAW_QUIET = np.float32([1, 1, 1, 1, 1, 1, 0.2])
@@ -40,6 +40,19 @@ def test_the_expert_solves_every_subtask(task, seed):
     assert done.dtype == np.float32 and done.shape[1] == 7
     assert np.abs(done).max() <= 1.0
     assert (np.abs(done).max(axis=0) > 0.001)[:6].all()  # it uses every axis
+
+
+@pytest.mark.parametrize("seed", [500092, 500127])
+def test_a_handoff_closes_where_the_wrist_has_room(seed):
+    """In the first of these, PSM1's wrist touches the phantom 0.9 mm before the goal."""
+    varied = RandomisationConfig(
+        phantom_shift=10.0, phantom_turn=15.0, pair="any", robot_start=15.0, needle_size=0.16,
+        needle_thickness=0.3, needle_arc="heldout",
+    )  # fmt: skip
+    env = make("handoff", scene=SceneConfig(ink="due"), randomisation=varied)
+    env.reset(seed=seed)
+    info, _ = solve(env)
+    assert info["is_success"]
 
 
 @pytest.mark.parametrize(("thread", "seed"), [(0, SEEDS[0]), (0, SEEDS[1]), (10, SEEDS[2])])

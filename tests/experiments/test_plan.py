@@ -351,6 +351,10 @@ def test_a_file_is_tried_small_beside_the_whole(tmp_path, monkeypatch, capsys):
             {"demonstrations": [{**TABLE["demonstrations"][0], "visits_of": "whole"}]},
             "task that is visited",
         ),
+        (
+            {"demonstrations": [{**TABLE["demonstrations"][1], "aim_noise": 1.0}]},
+            "'place' grasps nothing",
+        ),
         ({"policies": [{**TABLE["policies"][0], "view": ["front"]}]}, "'front'"),
         ({"policies": [{**TABLE["policies"][0], "part": "grsp"}]}, "'grasp'"),
         ({"policies": [TABLE["policies"][0], {**TABLE["policies"][0], "name": "a"}]}, "each once"),
