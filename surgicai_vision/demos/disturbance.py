@@ -45,9 +45,9 @@ class Disturbance:
             (docs/results/unmoved.md).
         aim_noise: standard deviation of how far past the grasp, along the needle, the executed
             motions aim [mm]. It is drawn anew every `AIM_STEPS`, and in `AIM_SHARE` of them. Noise
-            of single steps is corrected at once, so that it shows no state that is off by more than
-            0.5 mm; a policy that is, and was shown none, repeats the demonstrated motion from
-            there (docs/results/unmoved.md). The jaw follows the label.
+            of single steps is corrected at once, so that it shows few states that are far off; a
+            policy that is repeats the demonstrated motion from there (docs/results/unmoved.md). The
+            jaw follows the label.
         late: the most control steps by which a demonstrator that goes back notices a loss late;
             each episode draws its own. It shows the behaviour of a policy that has not noticed yet.
     """
