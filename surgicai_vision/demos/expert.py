@@ -128,6 +128,10 @@ class Expert(Demonstrator):
 class WorldState:
     """The present state as the expert needs it: measured poses in the world frame, (4, 4) matrices.
 
+    Args:
+        env: the env.
+        shift: how far past its goal a grasp aims, along the needle towards its tip [m].
+
     Attributes:
         arm: the active arm.
         stitch: the path through the holes.
@@ -141,8 +145,7 @@ class WorldState:
         command: T_world_tip that this command really means.
         command_jaw: commanded jaw angle [rad].
         holds: whether the active arm's jaws hold the needle.
-        miss: angle of the needle by which a grasp aims past its goal [rad]; 0 unless it should
-            miss.
+        miss: `shift` as an angle of the needle [rad].
     """
 
     def __init__(self, env: SuturingEnv, shift: float = 0.0):
