@@ -46,9 +46,14 @@ def test_the_expert_solves_every_subtask(task, seed):
 def test_a_handoff_closes_where_the_wrist_has_room(seed):
     """In the first of these, PSM1's wrist touches the phantom 0.9 mm before the goal."""
     varied = RandomisationConfig(
-        phantom_shift=10.0, phantom_turn=15.0, pair="any", robot_start=15.0, needle_size=0.16,
-        needle_thickness=0.3, needle_arc="heldout",
-    )  # fmt: skip
+        phantom_shift=10.0,
+        phantom_turn=15.0,
+        pair="any",
+        robot_start=15.0,
+        needle_size=0.16,
+        needle_thickness=0.3,
+        needle_arc="heldout",
+    )
     env = make("handoff", scene=SceneConfig(ink="due"), randomisation=varied)
     env.reset(seed=seed)
     info, _ = solve(env)
