@@ -74,8 +74,6 @@ class Agent(abc.ABC):
         cameras: cameras it needs, empty for none.
         image_size: height of their images [px].
         aspect: width of their images over their height.
-        part: share of an image's height that it looks at, if it cuts crops from whole images
-            (`corruption.Moment`).
         depth: whether it needs their depth too.
         privileged: whether it reads the env's own state, so that it acts only in simulation.
         action_mode: what its actions are, one of `names.ACTION_MODES`: "increments" of the active
@@ -86,7 +84,6 @@ class Agent(abc.ABC):
     cameras: tuple[str, ...] = ()
     image_size: int = 224
     aspect: float = 1.0
-    part: float = 1.0
     depth: bool = False
     privileged: bool = False
     action_mode: str = names.INCREMENTS
@@ -100,6 +97,13 @@ class Agent(abc.ABC):
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the actions (len(slots), 7) of the running slots; absolute ones have 16 values."""
+
+    def part(self, camera: str) -> float:
+        """Return the share of an image's height that it looks at (`corruption.Moment`).
+
+        It is below 1 for the images from which it cuts crops.
+        """
+        return 1.0
 
     def restart(self, slot: int) -> None:
         """Forget what the slot has planned: a subtask begins within the same episode."""
@@ -122,7 +126,6 @@ class WrappedAgent(Agent):
         self.cameras = agent.cameras
         self.image_size = agent.image_size
         self.aspect = agent.aspect
-        self.part = agent.part
         self.depth = agent.depth
         self.privileged = agent.privileged
         self.action_mode = agent.action_mode
@@ -131,6 +134,10 @@ class WrappedAgent(Agent):
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Reset the wrapped agent."""
         self.agent.reset(slot, robot, seed)
+
+    def part(self, camera: str) -> float:
+        """Return the wrapped agent's part."""
+        return self.agent.part(camera)
 
     def restart(self, slot: int) -> None:
         """Restart the wrapped agent."""

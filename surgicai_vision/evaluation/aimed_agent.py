@@ -5,7 +5,8 @@
 It looks at whole images of the crops' cameras, finds the jaws in them and cuts each crop about the
 jaws of its arm, at the scale that the nominal calibration gives. So it needs neither the reported
 joints nor the cameras' poses to aim, and errors of both are left out of the crops. The policy it
-wraps is unchanged. Inputs other than images still come from the reported joints.
+wraps is unchanged. Views that are no crops, such as a wrist camera's, stay as they are. Inputs
+other than images still come from the reported joints.
 """
 
 import dataclasses
@@ -53,18 +54,18 @@ def aimed(spec: "PolicySpec", detector: str | Path) -> "PolicySpec":
     Raises:
         BadFile: the folder holds no detector, or a damaged one.
         UnknownName: the detector does not know a camera of the policy's crops.
-        InputError: a policy with a view that is no crop, or a crop of an image that is not 4:3.
+        InputError: a policy without crops or with depth, or a crop of an image that is not 4:3.
     """
     folder = detector_folder(detector)
     card = load_detector(folder).card
     views = spec.run.views
-    lacking = [view for view in views if crop_of(view) is None]
-    if lacking or not views:
+    crops = [crop for crop in map(crop_of, views) if crop is not None]
+    if not crops or any(map(names.is_depth_view, views)):
+        seen = ", ".join(views) or "no images"
         raise InputError(
-            f"A detector aims crops, and {spec.name} sees {', '.join(lacking) or 'no images'}; "
-            "give a policy whose views are all crops, such as front_psm2."
+            f"A detector aims crops in colour, and {spec.name} sees {seen}; give a policy with "
+            "crops among its views, such as front_psm2, and no depth."
         )
-    crops = [_crop(view) for view in views]
     check_cameras(card, tuple(dict.fromkeys(crop.camera for crop in crops)))
     for crop in crops:
         if not can_be_aimed(crop):
@@ -85,19 +86,12 @@ def _make_aimed(make: MakeAgent, folder: Path) -> Agent:
     return AimedAgent(make(), load_detector(folder))
 
 
-def _crop(view: str) -> Crop:
-    """Return the crop called `view`; `aimed` has refused every other view."""
-    crop = crop_of(view)
-    assert crop is not None
-    return crop
-
-
 @final
 class AimedAgent(WrappedAgent):
     """An agent whose crops are cut from whole images.
 
     Args:
-        agent: who acts; it sees nothing but crops, of one size.
+        agent: who acts; its views have one size, and are square or up to 4:3 wide.
         detector: finds the jaws.
 
     Raises:
@@ -112,12 +106,18 @@ class AimedAgent(WrappedAgent):
             )
         super().__init__(agent)
         self._detector = detector
-        self._crops = {view: _crop(view) for view in agent.cameras}
+        self._crops = {view: crop_of(view) for view in agent.cameras}
         self._size = (agent.image_size, round(agent.image_size * agent.aspect))
-        self.cameras = tuple(dict.fromkeys(crop.camera for crop in self._crops.values()))
+        self._aimed = {crop.camera for crop in self._crops.values() if crop is not None}
+        self.cameras = tuple(
+            dict.fromkeys(crop.camera if crop else view for view, crop in self._crops.items())
+        )
         self.image_size = WHOLE[0]
         self.aspect = WHOLE[1] / WHOLE[0]
-        self.part = PART
+
+    def part(self, camera: str) -> float:
+        """Return `PART` for a camera from whose images crops are cut."""
+        return PART if camera in self._aimed else 1.0
 
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
@@ -129,11 +129,13 @@ class AimedAgent(WrappedAgent):
         """Return an observation whose crops are cut when they are accessed."""
         assert isinstance(observation, Mapping), "the env of an agent with cameras shows images"
         found = LazyMapping(
-            {camera: functools.partial(self._find, observation, camera) for camera in self.cameras},
+            {camera: functools.partial(self._find, observation, camera) for camera in self._aimed},
             {},
         )
-        crops = {
+        seen = {
             view: functools.partial(self._cut, observation, crop, found)
+            if crop
+            else functools.partial(self._whole, observation, view)
             for view, crop in self._crops.items()
         }
         others = {
@@ -141,7 +143,7 @@ class AimedAgent(WrappedAgent):
             for key in observation
             if key not in self.cameras
         }
-        return LazyMapping({**others, **crops}, {})
+        return LazyMapping({**others, **seen}, {})
 
     def _find(self, observation: Observation, camera: str) -> NDArray[np.float32]:
         """Return where a camera shows both arms' jaws, (2, 2), shares of width and height."""
@@ -155,6 +157,26 @@ class AimedAgent(WrappedAgent):
         """Return the crop about its arm's jaws."""
         place = found[crop.camera][names.ARMS.index(crop.arm)]
         return cut(image_of(observation, crop.camera), crop, place, self._size)
+
+    def _whole(self, observation: Observation, camera: str) -> "Image":
+        """Return what the wrapped agent's view of a camera shows."""
+        return middle(image_of(observation, camera), self._size)
+
+
+def middle(image: "Image", size: tuple[int, int]) -> "Image":
+    """Return the middle of a whole image, as the same camera shows it in an image of another size.
+
+    A camera's field of view is vertical, so a narrower image lacks the sides alone.
+
+    Args:
+        image: (height, width, 3).
+        size: height and width of the result [pixel], not wider in proportion.
+    """
+    height, width = image.shape[:2]
+    across = min(round(height * size[1] / size[0]), width)
+    left = (width - across) // 2
+    part = image[:, left : left + across]
+    return np.asarray(cv2.resize(part, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def cut(image: "Image", crop: Crop, place: NDArray[np.float32], size: tuple[int, int]) -> "Image":

@@ -222,12 +222,11 @@ def _check_condition(plan: "Plan", condition: Condition) -> None:
         for name in condition.policies or unless_named:
             acting = plan.suture.values() if name == names.SUTURE else (plan.policy(name),)
             views = [view for policy in acting for view in policy.view]
-            for view in views:
-                check_name("crop that a detector can aim", view, names.CROPS)
-            if not views:
+            if set(names.CROPS).isdisjoint(views) or any(map(names.is_depth_view, views)):
                 raise InputError(
-                    f"condition {condition.name}: a detector aims crops, and '{name}' sees no "
-                    "images; name policies that see crops, or leave aimed out."
+                    f"condition {condition.name}: a detector aims crops in colour, and '{name}' "
+                    f"sees {', '.join(views) or 'no images'}; name policies that see crops, or "
+                    "leave aimed out."
                 )
     if condition.shift is not None:
         check_name("axis", condition.shift.axis, AXES)

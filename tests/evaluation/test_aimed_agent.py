@@ -16,7 +16,7 @@ from surgicai_vision.detection.examples import PART, WHOLE
 from surgicai_vision.detection.network import JawNetwork
 from surgicai_vision.envs.projection import jaws_in_image
 from surgicai_vision.evaluation.agent import Agent
-from surgicai_vision.evaluation.aimed_agent import AimedAgent, aimed, cut
+from surgicai_vision.evaluation.aimed_agent import AimedAgent, aimed, cut, middle
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.robustness import shifted
 from surgicai_vision.evaluation.rollout import evaluate
@@ -123,8 +123,33 @@ def test_crops_follow_the_jaws_where_cameras_and_joints_are_off():
 
 def test_an_aimed_agent_asks_for_whole_images_and_says_so():
     agent = AimedAgent(Looking(), None)
-    assert agent.cameras == ("front", "back") and agent.part == PART
+    assert agent.cameras == ("front", "back")
+    assert agent.part("front") == agent.part("back") == PART
     assert (agent.image_size, round(agent.image_size * agent.aspect)) == WHOLE
+
+
+class WristAgent(Looking):
+    """Sees a camera on the arm as well."""
+
+    cameras = ("wrist_psm2", "front_psm2")
+
+
+def test_a_view_that_is_no_crop_stays_as_it_is(folder):
+    env = envs.make(TaskConfig("place"))
+    env.reset(seed=names.VALIDATION_SEED)
+    rendered = env.image("wrist_psm2", (SIDE, SIDE))
+    whole = env.image("wrist_psm2", WHOLE)
+    assert differ(middle(whole, (SIDE, SIDE)), rendered) < 3
+    assert differ(middle(whole[:, 16:], (SIDE, SIDE)), rendered) > 6  # 1.6 of its pixels aside
+    wide = env.image("wrist_psm2", (SIDE, SIDE * 4 // 3))
+    assert differ(middle(whole, wide.shape[:2]), wide) < 3
+    agent = AimedAgent(WristAgent(), TruthDetector(env))
+    assert agent.cameras == ("wrist_psm2", "front")
+    assert (agent.part("wrist_psm2"), agent.part("front")) == (1.0, PART)
+    spec = aimed(replace(spec_of(WristAgent.cameras), make=WristAgent), folder)
+    shown = shifted(spec, "all", 0.5)
+    for episode in evaluate(shown.make_agent, shown.config, [names.TEST_SEED], workers=1):
+        assert not episode.row.error
 
 
 def test_an_aimed_policy_is_evaluated_and_named_apart(folder):
@@ -140,8 +165,10 @@ def test_an_aimed_policy_is_evaluated_and_named_apart(folder):
 
 
 def test_what_cannot_be_aimed_is_refused(folder, tmp_path):
-    with pytest.raises(InputError, match="front"):
-        aimed(spec_of(("front", "back_psm2")), folder)
+    with pytest.raises(InputError, match="front, wrist_psm2"):
+        aimed(spec_of(("front", "wrist_psm2")), folder)
+    with pytest.raises(InputError, match="no depth"):
+        aimed(spec_of(("front_psm2", "front_psm2_depth")), folder)
     blind = replace(spec_of(), run=RunConfig(TaskConfig("place"), policy="zero"))
     with pytest.raises(InputError, match="no images"):
         aimed(blind, folder)

@@ -73,5 +73,5 @@ def test_whole_images_cannot_be_aimed():
         "demonstrations": [{**TABLE["demonstrations"][0], "view": ["front"]}],
         "policies": [{**TABLE["policies"][0], "view": ["front"]}],
     }
-    with pytest.raises(InputError, match="crop that a detector can aim"):
+    with pytest.raises(InputError, match="'place' sees front"):
         plan_of(table, "a test")

@@ -61,7 +61,7 @@ class CorruptedAgent(WrappedAgent):
         if not self.cameras:
             return observation
         moments = {
-            view: Moment(self._seeds[slot], self._steps[slot], camera_number(view), self.part)
+            view: Moment(self._seeds[slot], self._steps[slot], camera_number(view), self.part(view))
             for view in self.cameras
         }
 
