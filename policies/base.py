@@ -16,7 +16,7 @@ import abc
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, final
 
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE, check_hidden
+from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE, LATER, check_hidden
 from surgicai_vision.core.errors import (
     InputError,
     check_at_least,
@@ -93,6 +93,9 @@ class Recipe:
         proprioception_noise: noise on the measured poses in training, in standard deviations of
             each value; 0 adds none.
         map_shift: shift feature maps by up to this many places in training; 0 disables shifts.
+        instance_norm: standardise each channel of a feature map over its places, image by image
+            (Ulyanov et al., Instance normalization, 2016): what a look adds to a channel
+            everywhere, or multiplies it by, then does not reach the head.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -114,6 +117,7 @@ class Recipe:
     join_views: bool = False
     proprioception_noise: float = 0.0
     map_shift: int = 0
+    instance_norm: bool = field(default=False, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_finite(**{key: of for key, of in vars(self).items() if isinstance(of, float)})

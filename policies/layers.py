@@ -16,6 +16,12 @@ from surgicai_vision.core.errors import InputError
 
 POINTS = 32
 """Patterns of a spatial softmax (Levine et al., End-to-end visuomotor policies, JMLR 2016)."""
+FLAT = 0.05
+"""Variance below which instance normalisation takes a channel for flat.
+
+Inputs have variance 1 over all images and places; a channel that shows nothing in an image would
+otherwise be blown up to that.
+"""
 
 
 @final
@@ -131,6 +137,18 @@ def _head(shape: tuple[int, ...], map_head: str) -> Head:
     return heads[len(shape)](*shape)
 
 
+def _normalised(rows: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
+    """Return flattened maps with each channel standardised over its places.
+
+    Args:
+        rows: (B, C·h·w).
+        shape: (C, h, w); rows of any other feature are returned as they are.
+    """
+    if len(shape) != 3:
+        return rows
+    return nn.functional.instance_norm(rows.unflatten(1, shape), eps=FLAT).flatten(1)
+
+
 class _Heads(nn.Module):
     """The head of each feature.
 
@@ -138,12 +156,14 @@ class _Heads(nn.Module):
         inputs: the layout of the inputs.
         shapes: shape of each feature that has its own head.
         dim: length of the heads' output, 0 without images.
+        instance_norm: whether the heads see maps after instance normalisation.
     """
 
     def __init__(self, recipe: Recipe, inputs: Inputs):
         super().__init__()
         self.inputs = inputs
         self.shapes = visual_shapes(recipe, inputs.visual)
+        self.instance_norm = recipe.instance_norm
         heads = [_head(shape, recipe.map_head) for shape in self.shapes]
         self.heads = nn.ModuleList(heads)
         self.dim = sum(head.dim for head in heads)
@@ -156,6 +176,8 @@ class _Heads(nn.Module):
         """
         sizes = [math.prod(shape) for shape in self.shapes]
         *rows, vector = observed.split([*sizes, self.inputs.width], dim=1)
+        if self.instance_norm:
+            rows = [_normalised(row, of) for row, of in zip(rows, self.shapes, strict=True)]
         return [head(row) for head, row in zip(self.heads, rows, strict=True)], vector
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from policies.base import Plugin, Policy, Recipe
 from surgicai_vision import __version__
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, digest, to_mapping
+from surgicai_vision.core.config import JSON, digest, to_identity
 from surgicai_vision.core.errors import InputError, first_line
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
@@ -115,7 +115,7 @@ def request_table(request: TrainingRequest, start: Policy | None) -> dict[str, J
     weights = () if start is None else start.state_dict().values()
     return {
         "policy": request.policy.name,
-        "recipe": to_mapping(request.recipe),
+        "recipe": to_identity(request.recipe),
         "seed": request.seed,
         "dataset": request.dataset.fingerprint,
         "views": [entry.view for entry in request.features],

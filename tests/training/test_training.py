@@ -15,9 +15,9 @@ from fake_dataset import DIM, FakeDataset, features_of
 from policies.base import ACTIONS, Inputs, Plugin, Policy, Recipe
 from policies.bc import BC
 from policies.chunks import ChunkRecipe
-from policies.layers import MapConvolutions, SpatialSoftmax
+from policies.layers import FeatureMLP, MapConvolutions, SpatialSoftmax
 from surgicai_vision.core import names
-from surgicai_vision.core.config import RandomisationConfig, TaskConfig
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig, to_identity
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
 from surgicai_vision.core.files import TEMPORARY
 from surgicai_vision.training import policies
@@ -393,6 +393,41 @@ def test_convolutions_read_where_an_arc_lies_after_little_training() -> None:
     with torch.no_grad():
         error = (head(rows[500:]) - wanted[500:]).abs().mean() * 14
     assert error < 1.0, "in places of the map; a guess errs by 5"
+
+
+def test_instance_norm_hides_what_a_look_does_to_a_whole_channel() -> None:
+    """Another gain and offset of each channel change what the head reads without it alone."""
+    rng = torch.Generator().manual_seed(0)
+    shape = (6, 14, 14)
+    maps = torch.randn((4, *shape), generator=rng)
+    gain = 0.5 + 1.5 * torch.rand((4, 6, 1, 1), generator=rng)
+    other = gain * maps + torch.randn((4, 6, 1, 1), generator=rng)
+    vector = torch.zeros(4, 7)
+    moved = {}
+    for on in (False, True):
+        torch.manual_seed(0)
+        recipe = Recipe(map_head="convolutions", instance_norm=on)
+        network = FeatureMLP(recipe, Inputs((shape,)), 7).eval()
+        with torch.no_grad():
+            one, two = (network.seen(torch.cat([of.flatten(1), vector], 1)) for of in (maps, other))
+        moved[on] = float((two - one).abs().mean() / one.abs().mean())
+    assert moved[False] > 0.3 and moved[True] < 0.1 * moved[False], moved
+
+
+def test_instance_norm_leaves_what_is_no_map() -> None:
+    shown = torch.randn(3, 5 + 8)
+    answers = []
+    for on in (False, True):
+        torch.manual_seed(0)
+        network = FeatureMLP(Recipe(instance_norm=on), Inputs(((5,), (2, 4)), ()), 7).eval()
+        with torch.no_grad():
+            answers.append(network(shown))
+    assert torch.equal(*answers)
+
+
+def test_a_recipe_without_instance_norm_keeps_its_identity() -> None:
+    assert "instance_norm" not in to_identity(Recipe())
+    assert to_identity(Recipe(instance_norm=True))["instance_norm"] is True
 
 
 def test_recipes_name_how_maps_are_taken_in_and_how_many_frames() -> None:

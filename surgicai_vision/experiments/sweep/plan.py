@@ -487,7 +487,7 @@ def _card_digest(encoder: str) -> str:
 def _recipe_digest(policy: str, recipe: str, changes: tuple[str, ...], privileged: bool) -> str:
     """Hash a recipe with its changes; read once for all runs that share it."""
     run = RunConfig(policy=policy, recipe=recipe, changes=changes, privileged=privileged)
-    return digest(to_mapping(policies.recipe_of(run)))
+    return digest(to_identity(policies.recipe_of(run)))
 
 
 def _other_versions(run: RunConfig) -> list[str]:
