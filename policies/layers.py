@@ -17,10 +17,10 @@ from surgicai_vision.core.errors import InputError
 POINTS = 32
 """Patterns of a spatial softmax (Levine et al., End-to-end visuomotor policies, JMLR 2016)."""
 FLAT = 0.05
-"""Variance below which instance normalisation takes a channel for flat.
+"""Variance that instance normalisation adds to each channel's own.
 
-Inputs have variance 1 over all images and places; a channel that shows nothing in an image would
-otherwise be blown up to that.
+Inputs have variance 1 over all images and places. Without this, the noise of a channel that shows
+nothing in an image would be scaled up to that variance.
 """
 
 
