@@ -42,12 +42,12 @@ class Disturbance:
             it is not commanded to close: a random walk of closed jaws would drop the needle.
             Without this noise, open jaws are always exactly as open as the demonstrator holds them,
             and a policy never sees how to reopen jaws that have closed a little
-            (docs/results/unmoved.md).
+            (docs/results/unmoved-trials.md).
         aim_noise: standard deviation of how far past the grasp, along the needle, the executed
             motions aim [mm]. It is drawn anew every `AIM_STEPS`, and in `AIM_SHARE` of them. Noise
-            of single steps is corrected at once, so that it shows few states that are far off; a
-            policy that is repeats the demonstrated motion from there (docs/results/unmoved.md). The
-            jaw follows the label.
+            of single steps is corrected at once, so that it shows few states that are far off, and
+            a policy that comes to one repeats the demonstrated motion from there
+            (docs/results/unmoved-trials.md). The jaw follows the label.
         late: the most control steps by which a demonstrator that goes back notices a loss late;
             each episode draws its own. It shows the behaviour of a policy that has not noticed yet.
     """
