@@ -96,9 +96,6 @@ class Recipe:
         instance_norm: standardise each channel of a feature map over its places, image by image
             (Ulyanov et al., Instance normalization, 2016): what a look adds to a channel
             everywhere, or multiplies it by, then does not reach the head.
-        goal_loss: weight of a second loss, on where the goal lies (`names.GOAL_IN_TIP`): the policy
-            learns to tell it from what it sees, and acts on what it tells. The simulator is asked
-            in training alone. 0 learns from the demonstrated actions alone.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -121,7 +118,6 @@ class Recipe:
     proprioception_noise: float = 0.0
     map_shift: int = 0
     instance_norm: bool = field(default=False, metadata=LATER)
-    goal_loss: float = field(default=0.0, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_finite(**{key: of for key, of in vars(self).items() if isinstance(of, float)})
@@ -156,12 +152,7 @@ class Recipe:
                 "progress_input needs proprioception and replaces the clock; switch "
                 "proprioception on, and clock and privileged off."
             )
-        check_at_least(0, weight_decay=self.weight_decay, goal_loss=self.goal_loss)
-        if self.goal_loss and self.privileged:
-            raise InputError(
-                "goal_loss is for policies that must see where the goal lies; privileged tells "
-                "them. Leave one of them out."
-            )
+        check_at_least(0, weight_decay=self.weight_decay)
         if not self.proprioception_noise >= 0 or self.map_shift < 0:
             raise InputError(
                 f"proprioception_noise is {self.proprioception_noise}, map_shift {self.map_shift}; "
@@ -285,15 +276,12 @@ class Policy(nn.Module, abc.ABC):
         input_mean: mean of each input over the training frames, (inputs.dim,).
         input_std: standard deviation of each, 1 where an input is constant.
         checkpoint: the checkpoint that a loaded policy was restored from.
-        auxiliary: column that it also learns to tell in training, "" for none; the columns of
-            `target` in `loss` and `measure` are then those of its plug-in's target and of this.
         history: number of observations it sees, the present one last.
         averaging: largest decay of the moving average of its weights in training; the average is
             what is kept. 0 keeps the weights themselves.
         clip: gradient norm limit in training; 0 disables clipping.
     """
 
-    auxiliary: str = ""
     history: int = 1
     averaging: float = 0.0
     clip: float = 0.0

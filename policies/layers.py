@@ -195,16 +195,6 @@ class FeatureHeads(_Heads):
         return torch.cat(seen, dim=1) if seen else vector[:, :0], vector
 
 
-def mlp(recipe: Recipe, width: int, answers: int) -> nn.Sequential:
-    """Return the paper's layers, (B, width) → (B, answers)."""
-    layers: list[nn.Module] = []
-    for hidden in recipe.hidden:
-        layers += [nn.BatchNorm1d(width)] if recipe.batch_norm else []
-        layers += [nn.Linear(width, hidden), nn.ReLU()]
-        width = hidden
-    return nn.Sequential(*layers, nn.Linear(width, answers))
-
-
 @final
 class FeatureMLP(_Heads):
     """The paper's network on features and a vector: layers, each preceded by BatchNorm.
@@ -215,8 +205,13 @@ class FeatureMLP(_Heads):
 
     def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
         super().__init__(recipe, inputs)
-        self.width = self.dim + inputs.width
-        self.layers = mlp(recipe, self.width, answers)
+        layers: list[nn.Module] = []
+        self.width = width = self.dim + inputs.width
+        for hidden in recipe.hidden:
+            layers += [nn.BatchNorm1d(width)] if recipe.batch_norm else []
+            layers += [nn.Linear(width, hidden), nn.ReLU()]
+            width = hidden
+        self.layers = nn.Sequential(*layers, nn.Linear(width, answers))
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
         """Return (B, answers) for normalised inputs (B, inputs.dim)."""
@@ -227,29 +222,3 @@ class FeatureMLP(_Heads):
         """Return the heads' output concatenated with the vector, (B, width)."""
         seen, vector = self.outputs(observed)
         return torch.cat([*seen, vector], dim=1)
-
-
-@final
-class GoalMLP(_Heads):
-    """The paper's network twice: the first tells where the goal lies, the second acts on that too.
-
-    Args:
-        recipe: the settings of both.
-        inputs: the layout of the inputs.
-        answers: length of what it answers.
-        goal: length of what it tells about the goal.
-    """
-
-    def __init__(self, recipe: Recipe, inputs: Inputs, answers: int, goal: int):
-        super().__init__(recipe, inputs)
-        width = self.dim + inputs.width
-        self.goal = mlp(recipe, width, goal)
-        self.layers = mlp(recipe, width + goal, answers)
-
-    def forward(self, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (B, answers) and (B, goal) for normalised inputs (B, inputs.dim)."""
-        seen, vector = self.outputs(observed)
-        known = torch.cat([*seen, vector], dim=1)
-        goal: torch.Tensor = self.goal(known)
-        answers: torch.Tensor = self.layers(torch.cat([known, goal], dim=1))
-        return answers, goal

@@ -152,9 +152,6 @@ BOTH_ARMS = "both_arms"
 SETPOINT = "setpoint"
 """How far the active arm's set point lies from its measured tip pose and jaw."""
 PRIVILEGED_STATE = "privileged_state"
-GOAL_IN_TIP = "goal_in_tip"
-"""Computed: where the tip that meets the goal lies, seen from the tip (`training.data`)."""
-GOAL_IN_TIP_SIZE = 9
 """The 21 values of obs_type "state" with the goal; not a LeRobot key, so no policy is fed it."""
 
 RELATIVE_STATE = "relative_state"

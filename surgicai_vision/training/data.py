@@ -14,14 +14,10 @@ from surgicai_vision.core.config import clock
 from surgicai_vision.core.errors import check_name
 from surgicai_vision.core.runs import first_of_group
 from surgicai_vision.dataset.protocol import Dataset
-from surgicai_vision.scene.rotations import rpy_to_matrix
 from surgicai_vision.training.visits import stages
 
 if TYPE_CHECKING:
     from policies.base import Recipe
-
-CENTIMETRE = 0.01
-"""Unit of the positions in `names.PRIVILEGED_STATE` [m]."""
 
 Columns = Mapping[str, NDArray[np.generic]]
 
@@ -45,24 +41,8 @@ def _clock(columns: Columns, episode_index: NDArray[np.int64]) -> NDArray[np.flo
     return clock(steps).astype(np.float32)
 
 
-def _goal_in_tip(columns: Columns, _: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Return `names.GOAL_IN_TIP`, (N, 9) float32.
-
-    The tip's pose that meets the goal, in the frame of the tip now: its position [m], then the
-    first and the second column of its rotation.
-    """
-    check_name("column", names.PRIVILEGED_STATE, columns)
-    state = np.asarray(columns[names.PRIVILEGED_STATE], np.float64)
-    rows = []
-    for now, goal, error in zip(*np.split(state, 3, axis=1), strict=True):
-        into_tip = rpy_to_matrix(*now[3:6]).T
-        turned = into_tip @ rpy_to_matrix(*goal[3:6])
-        rows.append([*(into_tip @ error[:3] * CENTIMETRE), *turned[:, 0], *turned[:, 1]])
-    return np.asarray(rows, np.float32)
-
-
 COMPUTED: Mapping[str, Callable[[Columns, NDArray[np.int64]], NDArray[np.generic]]] = (
-    MappingProxyType({names.CLOCK: _clock, names.STAGE: stages, names.GOAL_IN_TIP: _goal_in_tip})
+    MappingProxyType({names.CLOCK: _clock, names.STAGE: stages})
 )
 """Computed column → function (columns, (N,) episode of every frame) → (N, n) values."""
 

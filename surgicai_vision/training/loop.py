@@ -74,8 +74,6 @@ class Training:
         self.vector = np.concatenate(fed, axis=1) if fed else None
         self.features = FeatureRows(request.features, device)
         target = request.columns[request.policy.target]
-        if self.policy.auxiliary:
-            target = np.concatenate([target, request.columns[self.policy.auxiliary]], axis=1)
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
         self.target = torch.from_numpy(target.astype(kind))
         history = self.policy.history

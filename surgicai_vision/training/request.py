@@ -54,12 +54,10 @@ class TrainingRequest:
 
     @functools.cached_property
     def columns(self) -> Mapping[str, NDArray[np.generic]]:
-        """The columns fed alongside features (else the state) and those learned, by name."""
+        """The columns fed alongside features (else the state) and the one learned, by name."""
         with torch.random.fork_rng(devices=[]):
-            policy = self.untrained()
-        keys = [*(policy.inputs.vector or (names.STATE,)), self.policy.target]
-        if policy.auxiliary:
-            keys.append(policy.auxiliary)
+            vector = self.untrained().inputs.vector
+        keys = (*(vector or (names.STATE,)), self.policy.target)
         return {key: column(self.dataset, key) for key in keys}
 
     def untrained(self) -> Policy:
@@ -88,11 +86,6 @@ def check_request(request: TrainingRequest) -> None:
         raise InputError(
             f"The dataset shows looks that are held out for tests ({held}); record one with "
             f"randomisation appearance: {names.TRAIN} and appearance_shift: 0."
-        )
-    if request.recipe.goal_loss and names.GOAL_IN_TIP not in request.columns:
-        raise InputError(
-            f"Policy '{request.policy.name}' does not learn where the goal lies; leave goal_loss "
-            "out, or use policy bc."
         )
     for entry in request.features:
         if (
