@@ -18,7 +18,11 @@ app = App(
 example:
   surgicai-vision submit outputs/evaluate/mine --name "My policy" --by "Jane Doe" --minutes 25
 an evaluation that it accepts:
-  surgicai-vision evaluate outputs/train/mine --episodes 100 --out outputs/evaluate/mine""",
+  surgicai-vision evaluate outputs/train/mine --episodes 100 --out outputs/evaluate/mine
+another, with everything shifted:
+  surgicai-vision robustness outputs/train/mine --axis all --strength 0.5 --episodes 100 \\
+      --out outputs/robustness/mine
+  surgicai-vision submit outputs/robustness/mine/all/0.5 --name Mine --by Me""",
 )
 
 
@@ -28,7 +32,7 @@ class Options:
     """Options of `submit`.
 
     Attributes:
-        evaluation: Folder that `evaluate --out` or a sweep wrote.
+        evaluation: Folder of an evaluation, by `evaluate`, a sweep or `robustness` (DIR/all/0.5).
         name: Name of the policy on the leaderboard.
         by: Who measured the policy.
         link: Address of the policy's code or paper, https://…
