@@ -83,8 +83,8 @@ class Recipe:
             frames the same phase.
         progress_input: feed the progress of the subtask, as predicted by a high-level policy with
             `progress`, instead of the clock (`train --progress-from`; needs proprioception).
-        map_head: head for feature maps: "softmax" (the position of each of 32 patterns) or
-            "convolutions".
+        map_head: head for feature maps: "softmax" (the position of each of 32 patterns),
+            "convolutions", or "keypoints" (convolutions, then the position of each of 32 patterns).
         frame_stride: train only on every N-th frame of an episode, from its first: neighbours show
             nearly the same.
         privileged: feed only the 21 values of obs_type "state", goal included: an upper bound.
@@ -123,7 +123,7 @@ class Recipe:
         check_finite(**{key: of for key, of in vars(self).items() if isinstance(of, float)})
         check_name("split", self.split, ("episode", "transition"))
         check_name("schedule", self.schedule, ("constant", "one_cycle"))
-        check_name("map_head", self.map_head, ("softmax", "convolutions"))
+        check_name("map_head", self.map_head, ("softmax", "convolutions", "keypoints"))
         check_at_least(1, frame_stride=self.frame_stride)
         check_hidden(self.hidden)
         check_at_most(MOST_EPOCHS, epochs=self.epochs)

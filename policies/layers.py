@@ -1,7 +1,7 @@
 """Layers that the policies share: the head of each kind of feature, and the paper's MLP.
 
 A global feature (the paper's) enters the MLP as it is. A feature map first passes through a trained
-spatial softmax or trained convolutions, tokens through a trained attention.
+spatial softmax, trained convolutions or both, tokens through a trained attention.
 """
 
 import math
@@ -41,17 +41,14 @@ class GlobalFeature(nn.Module):
 class SpatialSoftmax(nn.Module):
     """A trained spatial softmax: the image position of each of `POINTS` learned patterns."""
 
+    places: torch.Tensor
+
     def __init__(self, channels: int, height: int, width: int):
         super().__init__()
         self.shape = (channels, height, width)
         self.dim = 2 * POINTS
         self.patterns = nn.Conv2d(channels, POINTS, 1)
-        y, x = torch.meshgrid(
-            torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij"
-        )
-        self.register_buffer(
-            "places", torch.stack([x.flatten(), y.flatten()], dim=1), persistent=False
-        )
+        self.register_buffer("places", _places(height, width), persistent=False)
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Return the expected position of each pattern for flattened maps (B, C·h·w).
@@ -59,9 +56,21 @@ class SpatialSoftmax(nn.Module):
         Returns:
             (B, 2 · POINTS): x and y in [-1, 1].
         """
-        scores = self.patterns(rows.unflatten(1, self.shape)).flatten(2).softmax(dim=2)
-        places: torch.Tensor = scores @ self.places
-        return places.flatten(1)
+        return _expected(self.patterns(rows.unflatten(1, self.shape)), self.places)
+
+
+def _places(height: int, width: int) -> torch.Tensor:
+    """Return x and y in [-1, 1] of each place of a map, row by row, (height · width, 2)."""
+    y, x = torch.meshgrid(
+        torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij"
+    )
+    return torch.stack([x.flatten(), y.flatten()], dim=1)
+
+
+def _expected(scores: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Return the expected place of each pattern, (B, 2 · POINTS), from scores (B, POINTS, h, w)."""
+    expected: torch.Tensor = scores.flatten(2).softmax(dim=2) @ places
+    return expected.flatten(1)
 
 
 @final
@@ -98,6 +107,43 @@ class MapConvolutions(nn.Module):
 
 
 @final
+class Keypoints(nn.Module):
+    """Trained convolutions over a map, then the position of each of `POINTS` patterns.
+
+    The map is halved until at most 14 × 14 places are left. Unlike those of a spatial softmax, its
+    patterns see the needle's arc as a whole; unlike numbers of convolutions, positions of its tip
+    and of a hole mean the same for a needle of another size (docs/results/unmoved-trials.md).
+    """
+
+    WIDTH = 32
+    SMALLEST = 14
+    places: torch.Tensor
+
+    def __init__(self, channels: int, height: int, width: int):
+        super().__init__()
+        self.shape = (channels, height, width)
+        self.dim = 2 * POINTS
+        layers: list[nn.Module] = []
+        while max(height, width) > self.SMALLEST:
+            layers += [nn.Conv2d(channels, self.WIDTH, 3, stride=2, padding=1), nn.ReLU()]
+            channels = self.WIDTH
+            height = (height + 1) // 2
+            width = (width + 1) // 2
+        layers += [nn.Conv2d(channels, self.WIDTH, 3, padding=1), nn.ReLU()]
+        self.patterns = nn.Sequential(*layers, nn.Conv2d(self.WIDTH, POINTS, 3, padding=1))
+        self.register_buffer("places", _places(height, width), persistent=False)
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return the expected position of each pattern for flattened maps (B, C·h·w).
+
+        Returns:
+            (B, 2 · POINTS): x and y in [-1, 1].
+        """
+        # The convolution would copy a slice of wider rows, and again in the backward pass.
+        return _expected(self.patterns(rows.unflatten(1, self.shape).contiguous()), self.places)
+
+
+@final
 class TokenAttention(nn.Module):
     """A trained attention over tokens: one learned query chooses what to average."""
 
@@ -115,10 +161,11 @@ class TokenAttention(nn.Module):
         return mean
 
 
-Head = GlobalFeature | SpatialSoftmax | MapConvolutions | TokenAttention
+Head = GlobalFeature | SpatialSoftmax | MapConvolutions | Keypoints | TokenAttention
 MAP_HEADS: Mapping[str, Callable[..., Head]] = {
     "softmax": SpatialSoftmax,
     "convolutions": MapConvolutions,
+    "keypoints": Keypoints,
 }
 """`Recipe.map_head` → the head for a feature map."""
 

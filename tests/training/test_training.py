@@ -15,7 +15,7 @@ from fake_dataset import DIM, FakeDataset, features_of
 from policies.base import ACTIONS, Inputs, Plugin, Policy, Recipe
 from policies.bc import BC
 from policies.chunks import ChunkRecipe
-from policies.layers import FeatureMLP, MapConvolutions, SpatialSoftmax
+from policies.layers import MAP_HEADS, FeatureMLP, Keypoints, MapConvolutions, SpatialSoftmax
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig, to_identity
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
@@ -374,11 +374,11 @@ def test_spatial_softmax_finds_the_bright_place() -> None:
     np.testing.assert_allclose(head(image.flatten(1)).detach()[0, :2], [-1, 1], atol=1e-5)
 
 
-def test_convolutions_read_where_an_arc_lies_after_little_training() -> None:
+@pytest.mark.parametrize("name", ["convolutions", "keypoints"])
+def test_heads_read_where_an_arc_lies_after_little_training(name: str) -> None:
     torch.manual_seed(0)
-    head = torch.nn.Sequential(
-        MapConvolutions(1, 28, 28), torch.nn.Linear(MapConvolutions.FEATURES, 2)
-    )
+    reader = MAP_HEADS[name](1, 28, 28)
+    head = torch.nn.Sequential(reader, torch.nn.Linear(reader.dim, 2))
     places = torch.randint(4, 24, (600, 2))
     maps = torch.zeros(600, 28, 28)
     for index, (y, x) in enumerate(places.tolist()):
@@ -393,6 +393,27 @@ def test_convolutions_read_where_an_arc_lies_after_little_training() -> None:
     with torch.no_grad():
         error = (head(rows[500:]) - wanted[500:]).abs().mean() * 14
     assert error < 1.0, "in places of the map; a guess errs by 5"
+
+
+@pytest.mark.parametrize("side", [7, 14, 28, 56])
+def test_keypoints_of_a_shifted_map_are_shifted(side: int) -> None:
+    """What a pattern sees decides where it lies, whatever the size of the map."""
+    torch.manual_seed(0)
+    head = Keypoints(2, side, side)
+    step = -(-side // 14)  # places of the map to one place of a keypoint
+    with torch.no_grad():
+        head.patterns[-1].weight *= 1e4  # type: ignore[operator]
+        maps = torch.zeros(2, 2, side, side)
+        middle = side // 2
+        maps[0, :, middle - step : middle, middle - step : middle] = 1.0
+        maps[1, :, middle : middle + step, middle - step : middle] = 1.0
+        first, second = head(maps.flatten(1)).view(2, -1, 2)
+    assert first.shape == (head.dim // 2, 2) and first.abs().max() < 1.001
+    near = first.abs().max(dim=1).values < 0.5  # the border does not decide
+    assert near.any()
+    x, y = (second - first)[near].median(dim=0).values.tolist()
+    assert x == pytest.approx(0, abs=1e-3)
+    assert y == pytest.approx(2 / (min(side, 14) - 1), abs=0.02)
 
 
 def test_instance_norm_hides_what_a_look_does_to_a_whole_channel() -> None:
