@@ -16,6 +16,8 @@ from surgicai_vision.core.errors import InputError
 
 POINTS = 32
 """Patterns of a spatial softmax (Levine et al., End-to-end visuomotor policies, JMLR 2016)."""
+WIDTH = 32
+"""Channels of the trained convolutions over a map."""
 FLAT = 0.05
 """Variance that instance normalisation adds to each channel's own.
 
@@ -73,6 +75,25 @@ def _expected(scores: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     return expected.flatten(1)
 
 
+def _halved(
+    shape: tuple[int, int, int], smallest: int
+) -> tuple[list[nn.Module], tuple[int, int, int]]:
+    """Return trained convolutions that halve a map, and the shape (C, h, w) of what is left.
+
+    Args:
+        shape: (C, h, w) of the map.
+        smallest: it is halved until neither side has more places than this.
+    """
+    channels, height, width = shape
+    layers: list[nn.Module] = []
+    while max(height, width) > smallest:
+        layers += [nn.Conv2d(channels, WIDTH, 3, stride=2, padding=1), nn.ReLU()]
+        channels = WIDTH
+        height = (height + 1) // 2
+        width = (width + 1) // 2
+    return layers, (channels, height, width)
+
+
 @final
 class MapConvolutions(nn.Module):
     """Trained convolutions over a map, reduced to `FEATURES` numbers.
@@ -82,19 +103,13 @@ class MapConvolutions(nn.Module):
     """
 
     FEATURES = 64
-    WIDTH = 32
     SMALLEST = 7
 
     def __init__(self, channels: int, height: int, width: int):
         super().__init__()
         self.shape = (channels, height, width)
         self.dim = self.FEATURES
-        layers: list[nn.Module] = []
-        while max(height, width) > self.SMALLEST:
-            layers += [nn.Conv2d(channels, self.WIDTH, 3, stride=2, padding=1), nn.ReLU()]
-            channels = self.WIDTH
-            height = (height + 1) // 2
-            width = (width + 1) // 2
+        layers, (channels, height, width) = _halved(self.shape, self.SMALLEST)
         self.layers = nn.Sequential(
             *layers, nn.Flatten(), nn.Linear(channels * height * width, self.FEATURES), nn.ReLU()
         )
@@ -115,7 +130,6 @@ class Keypoints(nn.Module):
     and of a hole mean the same for a needle of another size (docs/results/unmoved-trials.md).
     """
 
-    WIDTH = 32
     SMALLEST = 14
     places: torch.Tensor
 
@@ -123,14 +137,9 @@ class Keypoints(nn.Module):
         super().__init__()
         self.shape = (channels, height, width)
         self.dim = 2 * POINTS
-        layers: list[nn.Module] = []
-        while max(height, width) > self.SMALLEST:
-            layers += [nn.Conv2d(channels, self.WIDTH, 3, stride=2, padding=1), nn.ReLU()]
-            channels = self.WIDTH
-            height = (height + 1) // 2
-            width = (width + 1) // 2
-        layers += [nn.Conv2d(channels, self.WIDTH, 3, padding=1), nn.ReLU()]
-        self.patterns = nn.Sequential(*layers, nn.Conv2d(self.WIDTH, POINTS, 3, padding=1))
+        layers, (channels, height, width) = _halved(self.shape, self.SMALLEST)
+        layers += [nn.Conv2d(channels, WIDTH, 3, padding=1), nn.ReLU()]
+        self.patterns = nn.Sequential(*layers, nn.Conv2d(WIDTH, POINTS, 3, padding=1))
         self.register_buffer("places", _places(height, width), persistent=False)
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
