@@ -96,6 +96,8 @@ class Recipe:
         instance_norm: standardise each channel of a feature map over its places, image by image
             (Ulyanov et al., Instance normalization, 2016): what a look adds to a channel
             everywhere, or multiplies it by, then does not reach the head.
+        speed: share of each action that is executed, above 0 and at most 1; the clock runs as much
+            slower. It does not affect what is learned (docs/evaluation.md).
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -118,6 +120,7 @@ class Recipe:
     proprioception_noise: float = 0.0
     map_shift: int = 0
     instance_norm: bool = field(default=False, metadata=LATER)
+    speed: float = field(default=1.0, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_finite(**{key: of for key, of in vars(self).items() if isinstance(of, float)})
@@ -165,6 +168,8 @@ class Recipe:
             )
         if not 0 <= self.validation < 1:
             raise InputError(f"validation is {self.validation}; give a share from 0 to below 1.")
+        if not 0 < self.speed <= 1:
+            raise InputError(f"speed is {self.speed}; give a share above 0, at most 1.")
 
 
 @dataclass(frozen=True)
@@ -276,12 +281,14 @@ class Policy(nn.Module, abc.ABC):
         input_mean: mean of each input over the training frames, (inputs.dim,).
         input_std: standard deviation of each, 1 where an input is constant.
         checkpoint: the checkpoint that a loaded policy was restored from.
+        speed: share of each of its actions that is executed, as its recipe has it.
         history: number of observations it sees, the present one last.
         averaging: largest decay of the moving average of its weights in training; the average is
             what is kept. 0 keeps the weights themselves.
         clip: gradient norm limit in training; 0 disables clipping.
     """
 
+    speed: float = 1.0
     history: int = 1
     averaging: float = 0.0
     clip: float = 0.0

@@ -52,6 +52,8 @@ class HLPRecipe(Recipe):
         for name in ("privileged", "setpoint", "progress_input"):
             if getattr(self, name):
                 raise InputError(f"Policy 'hlp' sees both arms and images; leave '{name}' off.")
+        if self.speed != 1:
+            raise InputError("Policy 'hlp' chooses subtasks and does not move; leave 'speed' at 1.")
 
 
 @final

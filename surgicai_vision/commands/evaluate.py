@@ -14,6 +14,7 @@ from surgicai_vision.commands.options import (
     SEED,
     VIEWS,
     AcceptLicence,
+    ActingChanges,
     DatasetFolder,
     DetectorName,
     EnvFields,
@@ -63,8 +64,8 @@ class Options:
         seed: Seed of the first start; each episode takes the next.
         workers: Number of processes.
         dataset: With policy replay, the dataset whose mean demonstration it plays.
-        change: For a policy that plans chunks, values of execute, samples and ensemble to use
-            instead of its recipe's.
+        change: Values of speed and, for a policy that plans chunks, of execute, samples and
+            ensemble to use instead of its recipe's.
         expert_swap: For a hierarchical policy, the subtask in which the expert acts instead; all
             takes each subtask in turn.
         upset: Make one thing go wrong in every episode, drawn by its start's seed: the needle is
@@ -85,9 +86,7 @@ class Options:
     dataset: DatasetFolder = None
     weights: WeightFiles = ()
     accept_licence: AcceptLicence = False
-    change: Annotated[
-        tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]"), default_text("none")
-    ] = ()
+    change: ActingChanges = ()
     detector: DetectorName = None
     expert_swap: Annotated[
         str | None, Parameter(choices=(*names.SUBTASKS, ALL), metavar="SUBTASK")

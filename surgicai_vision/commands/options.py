@@ -165,6 +165,10 @@ WeightFiles = Annotated[
 ]
 """Read by `encoders.WeightsSource.parse`, together with `AcceptLicence`."""
 AcceptLicence = Annotated[bool, Parameter(help="Accept weights under a non-commercial licence.")]
+ActingChanges = Annotated[
+    tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]"), default_text("none")
+]
+"""Settings of a recipe that do not affect what is learned (`ACTED_BY`); read by `open_policy`."""
 EnvFields = Annotated[dict[str, object] | None, FILE_ONLY]
 """Fields of `TaskConfig` to change; read by `task_config` or `open_policy`."""
 

@@ -16,6 +16,7 @@ from surgicai_vision.commands.options import (
     SEED,
     UNIQUE,
     AcceptLicence,
+    ActingChanges,
     DatasetFolder,
     DetectorName,
     EnvFields,
@@ -52,6 +53,8 @@ class Options:
         seed: Seed of the first start; each episode takes the next.
         workers: Number of processes.
         dataset: With policy replay, the dataset whose mean demonstration it plays.
+        change: Values of speed and, for a policy that plans chunks, of execute, samples and
+            ensemble to use instead of its recipe's.
         out: Folder to create or continue.
     """
 
@@ -71,6 +74,7 @@ class Options:
     dataset: DatasetFolder = None
     weights: WeightFiles = ()
     accept_licence: AcceptLicence = False
+    change: ActingChanges = ()
     out: Annotated[
         Path | None,
         DIRECTORY,
@@ -90,6 +94,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         options.env,
         options.dataset,
         WeightsSource.parse(options.weights, options.accept_licence),
+        changes=options.change,
         detector=options.detector,
     )
     out = options.out or folders.robustness_folder(spec, options.seed, options.episodes)

@@ -513,7 +513,7 @@ def check_frame_stride(frame_stride: int) -> None:
         )
 
 
-def clock(steps: "NDArray[np.int64]") -> "NDArray[np.float32]":
+def clock(steps: "NDArray[np.int64] | NDArray[np.float64]") -> "NDArray[np.float32]":
     """Encode the control steps (N,) since a subtask began for a policy, as (N, 3) float32.
 
     The values are the share of `SUBTASK_STEPS`, and the sine and cosine of a hand that turns once

@@ -189,6 +189,7 @@ class PolicyAgent(Agent):
         vector: its inputs besides features, keys of `policies.base.VECTORS`.
         progress: predicts the progress, for a policy with `names.PROGRESS` as an input.
         action_repeat: control steps for which an action was held in its training.
+        speed: share of each action that is executed; its clock runs as much slower.
     """
 
     def __init__(
@@ -201,6 +202,7 @@ class PolicyAgent(Agent):
         vector: tuple[str, ...] = (names.STATE,),
         progress: "PolicyAgent | None" = None,
         action_repeat: int = 1,
+        speed: float = 1.0,
     ):
         self.name = name
         self.views = views
@@ -215,6 +217,7 @@ class PolicyAgent(Agent):
         self._clocked = names.CLOCK in vector
         self._progress = progress
         self.action_repeat = action_repeat
+        self.speed = speed
         self._ticks: dict[int, int] = {}
         self._shared: FeatureTable | None = None
 
@@ -235,10 +238,10 @@ class PolicyAgent(Agent):
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the policy's actions (n, 7)."""
+        """Return the policy's actions (n, 7), at its speed."""
         ticks = [self._ticks[slot] for slot in slots]
         self._ticks.update({slot: tick + 1 for slot, tick in zip(slots, ticks, strict=True)})
-        return self.answer(robots, observations, ticks)
+        return self.answer(robots, observations, ticks) * np.float32(self.speed)
 
     def answer(
         self,
@@ -268,7 +271,7 @@ class PolicyAgent(Agent):
             [np.concatenate([told(robot) for told in self._told]) for robot in robots]
         )
         if self._clocked and ticks is not None:
-            clocks = clock(np.array(ticks) * self.action_repeat)
+            clocks = clock(np.array(ticks) * self.action_repeat * self.speed)
             vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)
         if self._progress is not None:
             said = self._progress.answer(robots, observations)[:, PROGRESS_AT:]

@@ -148,8 +148,7 @@ def open_policy(
         dataset: whose mean demonstration "replay" plays.
         expert_swap: the subtask of a hierarchical policy that the expert does instead.
         weights: where pretrained weights come from.
-        changes: `KEY=VALUE` of `ACTED_BY` that replace the recipe's, for a checkpoint of ours that
-            plans chunks.
+        changes: `KEY=VALUE` of `ACTED_BY` that replace the recipe's, for a checkpoint of ours.
 
     Raises:
         UnknownName: a name that is not known.
@@ -182,7 +181,7 @@ def open_policy(
         spec = _from_folder(path, task, weights, changes)
     if changes and not spec.run.acted_by:
         raise InputError(
-            f"--change {','.join(changes)} is for the checkpoint of a policy that plans chunks; "
+            f"--change {','.join(changes)} is for the checkpoint of one policy; "
             f"leave it out for {text}."
         )
     if released.is_released(text):
@@ -414,6 +413,7 @@ def _agent_of(policy: "Policy", weights: WeightsSource) -> PolicyAgent:
         policy.inputs.vector or (names.STATE,),
         policy_agent(progress, weights) if progress else None,
         checkpoint.task.action_repeat,
+        policy.speed,
     )
 
 

@@ -240,12 +240,11 @@ def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> 
 
     Args:
         checkpoint: the checkpoint to restore.
-        changes: recipe settings from `ACTED_BY` that replace its own when it acts; for policies
-            that plan chunks.
+        changes: recipe settings from `ACTED_BY` that replace its own when it acts.
 
     Raises:
         UnknownName: a setting that affects what is learned, or does not exist.
-        InputError: a value that is not allowed, or a policy that plans no chunks.
+        InputError: a value that is not allowed, or a setting of chunks for a policy without them.
     """
     plugin = policy_plugin(checkpoint.policy)
     for name in changes:
@@ -255,9 +254,9 @@ def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> 
                 f"'{checkpoint.policy}' answers with one action and has no {name} to change; "
                 "only policies that plan chunks have one."
             )
-    recipe = {**checkpoint.recipe, **changes}
+    recipe = from_mapping(plugin.recipe, {**checkpoint.recipe, **changes})
     try:
-        policy = plugin.make(from_mapping(plugin.recipe, recipe), checkpoint.visual)
+        policy = plugin.make(recipe, checkpoint.visual)
         policy.load_state_dict(read_tensors(checkpoint))
     except RuntimeError as error:
         raise BadFile(
@@ -265,6 +264,7 @@ def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> 
         ) from None
     policy.eval().requires_grad_(False)
     policy.checkpoint = checkpoint
+    policy.speed = recipe.speed
     return policy
 
 

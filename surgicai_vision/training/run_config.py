@@ -31,8 +31,8 @@ TERMINATIONS = ("privileged", "learned")
 """How a subtask ends under a hierarchical policy."""
 BUDGET = "minutes"
 """Recipe setting that limits the training time (`policies.chunks.ChunkRecipe`)."""
-ACTED_BY = ("execute", "samples", "ensemble")
-"""Settings of such a recipe for executing chunks; they do not affect what is learned."""
+ACTED_BY = ("speed", "execute", "samples", "ensemble")
+"""Settings of a recipe that do not affect what is learned: speed, and how chunks are executed."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,8 @@ class RunConfig:
         parts: digest of the file that names the policies of a hierarchical policy; empty if this
             run trains them.
         expert_swap: the subtask of a hierarchical policy that the expert performs.
-        acted_by: settings for executing its chunks in an evaluation, "key=value" each, instead of
-            its recipe's (`ACTED_BY`).
+        acted_by: settings by which it acts in an evaluation, "key=value" each, instead of its
+            recipe's (`ACTED_BY`).
         detector: hash of the weights of the detector that aims its crops in an evaluation
             (`evaluation.aimed_agent`); empty if crops lie where the arm reports its jaws.
         starts: start states of the evaluation; None before it.

@@ -142,6 +142,10 @@ def test_a_policy_with_a_clock_acts_by_it(tmp_path: Path) -> None:
     held = PolicyAgent("held", policy, None, (), 224, policy.inputs.vector, action_repeat=2)
     held.reset(0, Still(), 0)
     assert [held.act([0], [Still()], [None])[0, 0] for _ in range(20)] == early[::2]
+    slow = PolicyAgent("slow", policy, None, (), 224, policy.inputs.vector, speed=0.5)
+    slow.reset(0, Still(), 0)
+    halves = [slow.act([0], [Still()], [None])[0, 0] for _ in range(40)][::2]
+    np.testing.assert_array_equal(halves, np.float32(0.5) * np.array(early[:20]))
 
 
 def test_a_clock_goes_with_proprioception() -> None:

@@ -260,6 +260,7 @@ def test_an_evaluation_says_how_chunks_were_acted(tmp_path: Path, registered: No
     with pytest.raises(InputError, match="leave it out for expert"):
         open_policy("expert", task="grasp", changes=("execute=1",))
     train(whole, [], BC, Recipe(epochs=1), out=tmp_path / "b")
+    assert open_policy(tmp_path / "b", changes=("speed=0.5",)).name.endswith("-acting+speed=0.5")
     with pytest.raises(InputError, match="'bc' answers with one action"):
         open_policy(tmp_path / "b", changes=("execute=1",))
 
@@ -355,7 +356,9 @@ def test_the_average_is_the_weighted_sum_of_all_weights() -> None:
     assert layer.weight.item() == 3.0
 
 
-def acting(recipe: ChunkRecipe, action_repeat: int = 1) -> tuple[ChunkAgent, list[float]]:
+def acting(
+    recipe: ChunkRecipe, action_repeat: int = 1, speed: float = 1.0
+) -> tuple[ChunkAgent, list[float]]:
     """Return an agent of a policy without images, and the seeds it plans with."""
     policy = Linear(recipe, ())
     seeds: list[float] = []
@@ -367,7 +370,7 @@ def acting(recipe: ChunkRecipe, action_repeat: int = 1) -> tuple[ChunkAgent, lis
         return (start[-1] * 100 + start[0] * 10 + steps * np.ones((1, 1, 7))).astype(np.float32)
 
     policy.plan = plan  # type: ignore[method-assign,assignment]
-    senses = PolicyAgent("linear", policy, None, (), 32, action_repeat=action_repeat)
+    senses = PolicyAgent("linear", policy, None, (), 32, action_repeat=action_repeat, speed=speed)
     return ChunkAgent(policy, senses), seeds
 
 
@@ -406,6 +409,15 @@ def test_actions_that_are_held_are_fewer_than_control_steps() -> None:
     agent, _ = acting(replace(QUICK, execute=3, frame_stride=4), action_repeat=2)
     agent.reset(0, None, 7)
     assert moved(agent, 7) == [0, 1, 2, 310, 311, 312, 640], "as with stride 2, none held"
+
+
+def test_a_chunk_is_executed_at_the_policy_s_speed() -> None:
+    agent, _ = acting(replace(QUICK, execute=3, frame_stride=2))
+    agent.reset(0, None, 7)
+    whole = moved(agent, 7)
+    agent, _ = acting(replace(QUICK, execute=3, frame_stride=2), speed=0.5)
+    agent.reset(0, None, 7)
+    assert moved(agent, 7) == [action / 2 for action in whole]
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,11 @@ def test_inputs_that_it_does_not_read_are_refused(name: str) -> None:
         HLPRecipe(**{name: True})
 
 
+def test_a_speed_is_refused() -> None:
+    with pytest.raises(InputError, match="leave 'speed' at 1"):
+        HLPRecipe(speed=0.5)
+
+
 def test_without_progress_it_is_the_policy_it_was(tmp_path: Path) -> None:
     recipe = replace(RECIPE, progress=0.0, epochs=2)
     train(procedures(), [], HLP, recipe, out=tmp_path / "a")

@@ -451,6 +451,13 @@ def test_a_recipe_without_instance_norm_keeps_its_identity() -> None:
     assert to_identity(Recipe(instance_norm=True))["instance_norm"] is True
 
 
+def test_a_recipe_at_full_speed_keeps_its_identity() -> None:
+    assert "speed" not in to_identity(Recipe())
+    for wrong in (0.0, -0.5, 1.5):
+        with pytest.raises(InputError, match="speed is"):
+            Recipe(speed=wrong)
+
+
 def test_recipes_name_how_maps_are_taken_in_and_how_many_frames() -> None:
     best = load_recipe("bc", "best")
     assert BC.make(best, ((40, 28, 28),)).network.heads[0].dim == MapConvolutions.FEATURES  # type: ignore[attr-defined]
