@@ -64,8 +64,6 @@ class Options:
         seed: Seed of the first start; each episode takes the next.
         workers: Number of processes.
         dataset: With policy replay, the dataset whose mean demonstration it plays.
-        change: Values of speed and, for a policy that plans chunks, of execute, samples and
-            ensemble to use instead of its recipe's.
         expert_swap: For a hierarchical policy, the subtask in which the expert acts instead; all
             takes each subtask in turn.
         upset: Make one thing go wrong in every episode, drawn by its start's seed: the needle is

@@ -166,7 +166,13 @@ WeightFiles = Annotated[
 """Read by `encoders.WeightsSource.parse`, together with `AcceptLicence`."""
 AcceptLicence = Annotated[bool, Parameter(help="Accept weights under a non-commercial licence.")]
 ActingChanges = Annotated[
-    tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]"), default_text("none")
+    tuple[str, ...],
+    Parameter(
+        help="Values of speed and, for a policy that plans chunks, of execute, samples and "
+        "ensemble to use instead of its recipe's.",
+        metavar="KEY=VALUE[,KEY=VALUE]",
+    ),
+    default_text("none"),
 ]
 """Settings of a recipe that do not affect what is learned (`ACTED_BY`); read by `open_policy`."""
 EnvFields = Annotated[dict[str, object] | None, FILE_ONLY]

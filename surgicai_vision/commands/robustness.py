@@ -53,8 +53,6 @@ class Options:
         seed: Seed of the first start; each episode takes the next.
         workers: Number of processes.
         dataset: With policy replay, the dataset whose mean demonstration it plays.
-        change: Values of speed and, for a policy that plans chunks, of execute, samples and
-            ensemble to use instead of its recipe's.
         out: Folder to create or continue.
     """
 
