@@ -161,9 +161,7 @@ class SuturingEnv(gymnasium.Env):
         simulation = self.simulation
         first = self._subtasks[0]
         if axes.on:
-            # A generator of its own keeps a start the same whatever is randomised, so that
-            # evaluations can be paired.
-            draws = randomisation.draw(axes, self.np_random.spawn(1)[0])
+            draws = randomisation.draw(axes, randomisation.generator(self.np_random))
             simulation.randomise(randomisation.with_numbers(draws, given))
             self._meet_draws()
         for _ in range(START_DRAWS):

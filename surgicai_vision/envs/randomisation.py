@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 import mujoco
 import numpy as np
+from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
@@ -196,6 +197,27 @@ def report(config: RandomisationConfig, draws: Draws) -> dict[str, Array | int]:
         axis: np.array(draws[_PLACES[axis]]) for axis in config.on if axis in _PLACES
     }
     return drawn | ({"latency": config.latency} if config.latency else {})
+
+
+def generator(rng: np.random.Generator) -> np.random.Generator:
+    """Return the generator of an episode's numbers, whose start `rng` draws.
+
+    It is one of its own, so that a start is the same whatever is randomised, and evaluations can be
+    paired.
+    """
+    return rng.spawn(1)[0]
+
+
+def drawn(config: RandomisationConfig, seed: int) -> dict[str, Array | int]:
+    """Return what `info["randomisation"]` is after an env's `reset(seed=seed)`, without the env."""
+    rng, _ = np_random(seed)
+    return report(config, draw(config, generator(rng)))
+
+
+def arc_name(beyond: float) -> str:
+    """Return the arc (`NEEDLE_ARCS`) of a number of the axis `needle_arc` [rad]."""
+    angle = TIP_ANGLES[NEEDLE_ARCS[0]] + beyond
+    return min(TIP_ANGLES, key=lambda arc: abs(TIP_ANGLES[arc] - angle))
 
 
 def joint_offsets(draws: Draws) -> dict[str, Draws]:

@@ -5,6 +5,7 @@ Interface:
     hierarchical_bootstrap(groups, rng)  interval of a mean over training seeds and their episodes
     mcnemar(a, b)                        exact test of two policies on the same starts
     retention(plain, shifted)            what is left of a success rate, with its interval
+    differ(parts, rng)                   permutation test of several rates
     holm(p)                              p-values corrected for their number
     area_under_curve(strength, success)  mean success over a range of strengths
     area_interval(areas)                 its interval, from each episode's own area
@@ -256,6 +257,51 @@ def _wilson(successes: int, trials: int, quantile: float) -> tuple[float, float]
         max(0.0, (middle - reach) / (2 * (trials + square))),
         min(1.0, (middle + reach) / (2 * (trials + square))),
     )
+
+
+def differ(
+    parts: Sequence[ArrayLike], generator: np.random.Generator, resamples: int = 4_999
+) -> float:
+    """Return the p-value of several parts having the same mean: a permutation test.
+
+    Under the null hypothesis, which part a start is in does not matter. The statistic is the sum of
+    squares between the parts. With few starts all permutations are counted, else `resamples`.
+
+    Args:
+        parts: the successes of each part's starts, numbers from 0 to 1; at least two parts, none
+            of them empty.
+        generator: draws the permutations.
+        resamples: most permutations, besides the parts as they are.
+
+    Raises:
+        InputError: fewer than two parts, or an empty one.
+    """
+    from scipy.stats import permutation_test
+
+    samples = [np.asarray(part, np.float64) for part in parts]
+    if len(samples) < 2 or not all(part.size for part in samples):
+        raise InputError(
+            f"Parts of {[part.size for part in samples]} starts; give two or more, none empty."
+        )
+
+    edges = np.cumsum([part.size for part in samples])[:-1]
+
+    def between(values: Array, axis: int = -1) -> Array:
+        parts = np.split(values, edges, axis=axis)
+        squares = [part.shape[axis] * np.square(part.mean(axis=axis)) for part in parts]
+        total: Array = np.sum(squares, axis=0)
+        return total
+
+    test = permutation_test(
+        (np.concatenate(samples),),
+        between,
+        permutation_type="pairings",
+        vectorized=True,
+        n_resamples=resamples,
+        alternative="greater",
+        rng=generator,
+    )
+    return float(test.pvalue)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

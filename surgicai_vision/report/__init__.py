@@ -5,7 +5,7 @@ A results folder holds evaluations (`storage.find_evaluations`) at any depth. It
 includes a sweep's runs without a result, with the reason. Images are rendered again from the states
 kept of each episode, so results stay small and the page can be rebuilt at any time.
 
-    reader → groups (over training seeds) → pairs, curves, films → page, tables
+    reader → groups (over training seeds) → pairs, dependences, curves, films → page, tables
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from surgicai_vision.core import files
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.evaluation.storage import GRID_FILE, RUN_FILE
 from surgicai_vision.report import figures, filmstrips, page
+from surgicai_vision.report.dependence import dependences
 from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.pairs import compare
@@ -67,12 +68,13 @@ def write_report(
     collected = collect(folder, planned)
     groups = group(collected)
     pairs = compare(groups)
+    found = dependences(groups)
     title = collected.run.get("title", folder.resolve().name)
     report(1, strips + 3)
     reel = filmstrips.make_reel(groups, strips, lambda done, total: report(1 + done, total + 3))
     path = out or folder / PAGE_FILE
     filled = {
-        **page.numbers(collected, groups, pairs),
+        **page.numbers(collected, groups, pairs, found),
         **origin(collected, groups),
         **figures.static_images(groups, reel),
         "details": page.details(
@@ -83,7 +85,7 @@ def write_report(
         "video": opening_video(folder, path, collected.run),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    tables = write_tables(path.parent, groups, pairs, title)
+    tables = write_tables(path.parent, groups, pairs, found, title)
     sheet = failure_sheet(groups, reel)
     if sheet:
         write_changed(tables / FAILURES_FILE, sheet)

@@ -9,7 +9,8 @@ from markupsafe import Markup
 from surgicai_vision.core import names, percentages
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.core.words import noun, plural
-from surgicai_vision.report import charts, curves, paper, sections
+from surgicai_vision.report import charts, curves, dependence, paper, sections
+from surgicai_vision.report.dependence import Dependence
 from surgicai_vision.report.episodes import group_details, letters
 from surgicai_vision.report.filmstrips import Reel
 from surgicai_vision.report.groups import (
@@ -48,7 +49,10 @@ def render(page: dict[str, object]) -> str:
 
 
 def numbers(
-    collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]
+    collected: Collected,
+    groups: Sequence[Group],
+    pairs: Sequence[Pair],
+    dependences: Sequence[Dependence],
 ) -> dict[str, object]:
     """Return everything but images and provenance."""
     index = {item.condition: at for at, item in enumerate(groups)}
@@ -80,6 +84,8 @@ def numbers(
         "robustness": curves.robustness_curves(groups),
         "retentions": retentions(groups),
         "looks": looks(groups),
+        "dependences": dependence.rows(dependences),
+        "few": dependence.FEW,
         "procedure": curves.procedure(groups),
         "learned": learned(groups),
         "learned_source": paper.LEARNED_SOURCE,

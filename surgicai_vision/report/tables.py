@@ -1,8 +1,9 @@
 """Tables: the page's numbers as Markdown, LaTeX (booktabs), CSV and Parquet.
 
 `table.*` have one row per condition, `cells.parquet` one per cell (a training seed), including
-those without a result, and `pairs.csv` one per comparison. `algorithms.md`, written if actors were
-evaluated, has our numbers next to those of the paper's tables 1 and 4.
+those without a result, `pairs.csv` one per comparison, and `dependence.csv` one per condition,
+quantity that was drawn and part of the starts. `algorithms.md`, written if actors were evaluated,
+has our numbers next to those of the paper's tables 1 and 4.
 """
 
 import csv
@@ -17,6 +18,7 @@ from surgicai_vision.evaluation import statistics
 from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.evaluation.storage import parquet_bytes
 from surgicai_vision.report import text
+from surgicai_vision.report.dependence import Dependence, records
 from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.formats import latex, markdown
 from surgicai_vision.report.groups import MEASURES, Group, measured
@@ -29,7 +31,13 @@ from surgicai_vision.report.reinforcement import markdown as learned_markdown
 FOLDER = "tables"
 
 
-def write_tables(folder: Path, groups: Sequence[Group], pairs: Sequence[Pair], title: str) -> Path:
+def write_tables(
+    folder: Path,
+    groups: Sequence[Group],
+    pairs: Sequence[Pair],
+    dependences: Sequence[Dependence],
+    title: str,
+) -> Path:
     """Write every table below `folder` and return their folder."""
     out = folder / FOLDER
     out.mkdir(parents=True, exist_ok=True)
@@ -39,6 +47,7 @@ def write_tables(folder: Path, groups: Sequence[Group], pairs: Sequence[Pair], t
         "table.csv": _csv([condition_record(item) for item in groups]),
         "cells.parquet": parquet_bytes(_filled(list(cell_records(groups)))),
         "pairs.csv": _csv([_pair_record(pair) for pair in pairs]),
+        "dependence.csv": _csv(records(dependences)),
     }
     found = learned(groups)
     if found:

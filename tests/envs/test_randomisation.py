@@ -222,6 +222,28 @@ def test_the_same_seed_gives_the_same_trajectory_again():
     np.testing.assert_array_equal(first, played(env, 4))
 
 
+@pytest.mark.parametrize("task", ["grasp", "suture"])
+def test_what_is_drawn_for_a_seed_is_known_without_an_env(task):
+    everything = dataclasses.replace(EVERYTHING, appearance="heldout", distractors=3, latency=0)
+    env = envs.make(TaskConfig(task, randomisation=everything))
+    for seed in (3, names.TEST_SEED):
+        _, info = env.reset(seed=seed)
+        drawn = randomisation.drawn(everything, seed)
+        assert drawn.keys() == info["randomisation"].keys()
+        for axis, numbers in info["randomisation"].items():
+            np.testing.assert_array_equal(drawn[axis], numbers, err_msg=axis)
+
+
+@pytest.mark.parametrize(("choice", "allowed"), [("train", ("1/3", "1/2")), ("heldout", ("3/8",))])
+def test_an_arc_is_named_by_its_number(choice, allowed):
+    config = RandomisationConfig(needle_arc=choice)
+    drawn = {
+        randomisation.arc_name(float(randomisation.drawn(config, seed)["needle_arc"][0]))
+        for seed in range(20)
+    }
+    assert drawn == set(allowed)
+
+
 def test_the_phantom_moves_with_its_goals():
     plain, moved = made("place"), made("place", phantom_shift=2.0)
     _, info = moved.reset(seed=1)

@@ -4,17 +4,19 @@ Coverage is checked by simulation and by exact sums.
 """
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
-from scipy.stats import beta, binom, binomtest, multinomial, t
+from scipy.stats import beta, binom, binomtest, hypergeom, multinomial, t
 
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.evaluation.statistics import (
     area_interval,
     area_under_curve,
     clopper_pearson,
+    differ,
     hierarchical_bootstrap,
     holm,
     mcnemar,
@@ -93,6 +95,45 @@ def holm_by_closure(p_values):
         )
         for index in every
     ]
+
+
+def test_two_parts_differ_as_by_fishers_exact_test():
+    """With two parts and all permutations, the two-sided test by the sum of squares is Fisher's."""
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        sizes = rng.integers(1, 5, 2)
+        won = [(rng.random(size) < 0.5).astype(float) for size in sizes]
+        counts = [[int(part.sum()), int((1 - part).sum())] for part in won]
+        spread = [part.size * part.mean() ** 2 for part in won]
+        total, all_ = int(sum(part.sum() for part in won)), int(sum(sizes))
+        chances = hypergeom(all_, total, int(sizes[0])).pmf
+        expected = sum(
+            chances(first)
+            for first in range(min(total, int(sizes[0])) + 1)
+            if total - first <= sizes[1]
+            and first**2 / sizes[0] + (total - first) ** 2 / sizes[1] >= sum(spread) - 1e-9
+        )
+        p = differ(won, rng, resamples=math.factorial(all_))
+        assert p == pytest.approx(expected, abs=1e-9), counts
+
+
+def test_parts_that_are_alike_differ_by_chance_alone():
+    rng = np.random.default_rng(5)
+    chances = [
+        differ([rng.random(size) < 0.7 for size in (30, 25, 1)], rng, resamples=199)
+        for _ in range(400)
+    ]
+    for level in (0.05, 0.2):
+        # A permutation test is exact: at most that share, within five standard errors.
+        share = np.mean(np.array(chances) <= level)
+        assert share <= level + 5 * math.sqrt(level * (1 - level) / len(chances))
+    assert differ([[1.0] * 30, [0.0] * 30, [1.0] * 30], rng) < 0.001
+
+
+@pytest.mark.parametrize("parts", [[], [[1.0]], [[1.0], []]])
+def test_one_part_cannot_differ(parts):
+    with pytest.raises(InputError, match="two or more"):
+        differ(parts, np.random.default_rng(0))
 
 
 def test_holm_equals_its_definition_on_random_tables():

@@ -250,7 +250,7 @@ def test_cells_keep_their_columns_where_the_first_has_no_result(tmp_path):
     (tmp_path / "run.json").write_text(json.dumps(missing))
     found = group(collect(tmp_path))
     assert not found[0].episodes
-    table = pq.read_table(tables.write_tables(tmp_path, found, [], "title") / "cells.parquet")
+    table = pq.read_table(tables.write_tables(tmp_path, found, [], [], "title") / "cells.parquet")
     assert {"low", "high", "command", "missed"} <= set(table.column_names)
 
 
