@@ -60,6 +60,8 @@ class Options:
         distractors: Largest number of distractor objects, drawn with the look.
         variants: Number of looks in which to render each demonstration.
         corruption: Largest strength of smoke, blur and pixel noise, each drawn with the look.
+        shift: Strength by which cameras, lights and joints are off, drawn with the look.
+        aimed: Place crops where a detector would see the jaws, not where the arm reports them.
         workers: Number of processes.
         out: Folder of the dataset to create.
     """
@@ -88,6 +90,8 @@ class Options:
     distractors: Annotated[int | None, within(1, 5), default_text("as recorded")] = None
     variants: Annotated[int, COUNT] = 1
     corruption: Annotated[float, FRACTION] = 0.0
+    shift: Annotated[float, FRACTION] = 0.0
+    aimed: bool = False
     video: Annotated[str | None, VIDEO, default_text("lossless images")] = None
     workers: Annotated[int, COUNT] = folders.CORES
     executor: Annotated[str, EXECUTOR] = "local"
@@ -115,12 +119,15 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             "recorded."
         )
     variants = None
-    if options.appearance or options.distractors or options.corruption or options.variants > 1:
+    drawn = (options.appearance, options.distractors, options.corruption)
+    if any((*drawn, options.shift, options.aimed)) or options.variants > 1:
         variants = Variants(
             options.appearance or "",
             options.distractors or 0,
             options.variants,
             options.corruption,
+            options.shift,
+            options.aimed,
         )
     task = folders.demos_task(options.demos[0]) if options.demos else options.task or "grasp"
     of_others = "" if options.layout == "surgicai" else f"-{options.layout}"

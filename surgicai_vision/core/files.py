@@ -288,7 +288,7 @@ SHARED = tuple(
     PACKAGE / "core" / f"{name}.py"
     for name in (
         *("cameras", "config", "corruption", "generators", "names", "runs", "tasks"),
-        *("variants", "video"),
+        *("shifts", "variants", "video"),
     )
 )
 """Modules of `core` whose sources decide results, in every stage."""

@@ -5,6 +5,7 @@ before action t. This module needs MuJoCo, so only the processes that render imp
 """
 
 import atexit
+import dataclasses
 import functools
 import hashlib
 import json
@@ -19,9 +20,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from surgicai_vision import envs
-from surgicai_vision.core import names
+from surgicai_vision.core import names, shifts
 from surgicai_vision.core.cameras import camera_number
-from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.corruption import CORRUPTIONS, Image, Moment, spoilt
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import write_json
@@ -32,6 +33,9 @@ from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, column_array, compression
 from surgicai_vision.demos.store import Demo, read_demo
+from surgicai_vision.envs import randomisation
+from surgicai_vision.envs.aimed_calibration import AimedCalibration
+from surgicai_vision.envs.calibration import Calibration
 from surgicai_vision.envs.looks import draw as draw_look
 from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.rendering import renderer_string
@@ -86,7 +90,7 @@ def render_episode(
     chosen = LAYOUTS[layout]
     episode = read_demo(Path(demo))
     looks = from_mapping(Variants, variants) if variants else None
-    config = looks.shown(episode.config) if looks else episode.config
+    config = _rendered_in(looks, episode.config) if looks else episode.config
     env = _env(json.dumps(to_mapping(config)), tuple(views), size, depth, segmentation)
     if env.scene.hash != episode.scene_hash:
         raise BadFile(
@@ -102,6 +106,10 @@ def render_episode(
         key: [] for key in (*chosen.measured, *schema.calibration_keys(views))
     }
     shown = _Shown.drawn(looks, episode, variant) if looks else _Shown()
+    is_aimed = looks is not None and looks.aimed
+    env.place_crops_by(
+        AimedCalibration(env.simulation, shown.seed) if is_aimed else Calibration(env.simulation)
+    )
     for step, state in enumerate(episode.state[:-1:frame_stride]):
         env.set_state_vector(env.simulation.redrawn(state, shown.look) if shown.look else state)
         observation = env.observe()
@@ -146,6 +154,13 @@ def render_episode(
     write_json(folder / SUMMARY_FILE, summary)
 
 
+def _rendered_in(looks: Variants, config: TaskConfig) -> TaskConfig:
+    """Return the task with everything that is drawn for the variants of its demonstrations."""
+    shown = looks.shown(config)
+    axes = shifts.added(shown.randomisation, shifts.RENDERED, looks.shift)
+    return dataclasses.replace(shown, randomisation=axes)
+
+
 @dataclass(frozen=True)
 class _Shown:
     """The appearance of a variant.
@@ -153,7 +168,7 @@ class _Shown:
     Attributes:
         look: axis of randomisation → its numbers; empty keeps what was recorded.
         strengths: corruption of its images → strength.
-        seed: seed of the corruptions.
+        seed: seed of the corruptions and of the crops' aim.
     """
 
     look: Mapping[str, Sequence[float]] = MappingProxyType({})
@@ -165,11 +180,13 @@ class _Shown:
         """Draw a variant from the recorded states and the variant's number."""
         recorded = int(hashlib.sha256(demo.state.tobytes()).hexdigest(), 16)
         rng = np.random.default_rng([LOOK_STREAM, recorded, variant])
-        look = draw_look(looks.shown(TaskConfig()).randomisation, rng)
-        if not looks.corruption:
-            return cls(look)
+        look = {**draw_look(looks.shown(TaskConfig()).randomisation, rng)}
+        if looks.shift:
+            off = shifts.added(RandomisationConfig(), shifts.RENDERED, looks.shift)
+            numbers = randomisation.report(off, randomisation.draw(off, rng.spawn(1)[0]))
+            look |= {axis: np.atleast_1d(drawn).tolist() for axis, drawn in numbers.items()}
         strengths = {kind: looks.corruption * rng.random() for kind in CORRUPTIONS}
-        return cls(look, strengths, int(rng.integers(2**32)))
+        return cls(look, strengths if looks.corruption else {}, int(rng.integers(2**32)))
 
     def spoilt(self, image: Image, step: int, view: str) -> Image:
         """Return an image (height, width, 3) after the corruptions of a control step."""

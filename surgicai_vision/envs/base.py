@@ -516,6 +516,10 @@ class SuturingEnv(gymnasium.Env):
             return LazyMapping(self._makers(), beside)
         return self._images.look(self.view) | beside
 
+    def place_crops_by(self, calibration: Calibration) -> None:
+        """Show crops where `calibration` places them from now on."""
+        self.calibration = self._images.calibration = calibration
+
     def defer_images(self) -> None:
         """Render each image of an observation only when it is first accessed (`core.lazy`).
 

@@ -20,12 +20,12 @@ class Images:
 
     Args:
         simulation: the env's.
-        calibration: its nominal calibration, which says where crops lie.
+        calibration: says where crops lie.
     """
 
     def __init__(self, simulation: Simulation, calibration: Calibration):
         self._simulation = simulation
-        self._calibration = calibration
+        self.calibration = calibration
         self._renderer: FrameRenderer | None = None
         self._stands: dict[str, str] = {}
 
@@ -49,7 +49,7 @@ class Images:
         if view not in self._stands:
             self._stands[view] = stand(view)
         camera = self._stands[view]
-        window = self._calibration.window(view, size) if camera != view else None
+        window = self.calibration.window(view, size) if camera != view else None
         return renderer.render_all(self._simulation.data, camera, modalities, window)
 
     def free(self, orbit: Orbit, size: tuple[int, int], quality: str = "fast") -> Frame:

@@ -53,6 +53,8 @@ class Demonstrations:
         distractors: most distractors in the rendered scene; 0 leaves those that were recorded.
         variants: in how many looks each demonstration is rendered.
         corruption: largest strength of smoke, blur and pixel noise on the rendered images.
+        shift: strength by which cameras, lights and joints are off in the rendered images.
+        aimed: crops are rendered where a detector would see the jaws.
         of: name of demonstrations of the same task, which are re-posed to new starts where the
             demonstrator is "multiply" (`demos.multiply`).
         learner: name of a policy of the same task that acts at first, from starts that it was not
@@ -86,6 +88,8 @@ class Demonstrations:
     learner: str = field(default="", metadata=LATER)
     jaw_noise: float = field(default=0.0, metadata=LATER)
     aim_noise: float = field(default=0.0, metadata=LATER)
+    shift: float = field(default=0.0, metadata=LATER)
+    aimed: bool = field(default=False, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_name("demonstrator", self.demonstrator, DEMONSTRATORS)
@@ -111,9 +115,17 @@ class Demonstrations:
     @property
     def looks(self) -> Variants | None:
         """The looks each is rendered in; None keeps the recorded look."""
-        if not (self.appearance or self.distractors or self.corruption) and self.variants == 1:
+        drawn = (self.appearance, self.distractors, self.corruption, self.shift, self.aimed)
+        if not any(drawn) and self.variants == 1:
             return None
-        return Variants(self.appearance, self.distractors, self.variants, self.corruption)
+        return Variants(
+            self.appearance,
+            self.distractors,
+            self.variants,
+            self.corruption,
+            self.shift,
+            self.aimed,
+        )
 
     def shown(self, env: TaskConfig) -> TaskConfig:
         """Return the task as their images show it, where it is recorded in `env`."""

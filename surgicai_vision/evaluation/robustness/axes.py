@@ -11,19 +11,14 @@ every axis at every strength.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from surgicai_vision.core.config import (
-    RANDOMISATION_LIMITS,
-    RandomisationConfig,
-    TaskConfig,
-    from_mapping,
-)
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.shifts import WORLD, added
 from surgicai_vision.evaluation.agent import Agent, MakeAgent
 from surgicai_vision.training.run_config import Shift, evaluated_in
 
@@ -56,18 +51,18 @@ _SINGLE: Mapping[str, Axis] = MappingProxyType(
     {
         "camera": Axis(
             "cameras off by ±10 mm and ±10° about each axis",
-            {"camera_shift": 10.0, "camera_turn": 10.0},
+            WORLD["camera"],
         ),
-        "field_of_view": Axis("vertical field of view off by ±10°", {"camera_fovy": 10.0}),
-        "light": Axis("brightness of each light off by ±80 %", {"light": 0.8}),
-        "tint": Axis("colour channels of tissue and surroundings off by ±80 %", {"colour": 0.8}),
+        "field_of_view": Axis("vertical field of view off by ±10°", WORLD["field_of_view"]),
+        "light": Axis("brightness of each light off by ±80 %", WORLD["light"]),
+        "tint": Axis("colour channels of tissue and surroundings off by ±80 %", WORLD["tint"]),
         "tissue": Axis(
             "tissue, drape, needle, instruments and light all look as in a held-out family",
-            {"appearance_shift": 1.0},
+            WORLD["tissue"],
         ),
         "distractors": Axis(
             "up to 5 objects lie around: a second needle, gauze, a clip, cut thread, blood",
-            {"distractors": 5},
+            WORLD["distractors"],
         ),
         "smoke": Axis(
             "drifting grey smoke that hides 40 to 90 % of what lies behind it", images=("smoke",)
@@ -79,20 +74,20 @@ _SINGLE: Mapping[str, Axis] = MappingProxyType(
             "Gaussian pixel noise, standard deviation 64 of 255 grey levels", images=("noise",)
         ),
         "latency": Axis(
-            "actions take effect 5 control steps (100 ms) later", {"latency": 5}, seen=False
+            "actions take effect 5 control steps (100 ms) later", WORLD["latency"], seen=False
         ),
         "kinematic_error": Axis(
             "first three joints off by ±5°, ±5°, ±5 mm, unknown to the arm",
-            {"kinematic_error": 1.0},
+            WORLD["kinematic_error"],
             seen=False,
         ),
         "needle": Axis(
             "radius of the needle's arc off by ±20 %, its thickness by ±30 %",
-            {"needle_size": 0.2, "needle_thickness": 0.3},
+            WORLD["needle"],
             seen=False,
         ),
         "robot_start": Axis(
-            "both arms' tips start off by ±15 mm along each axis", {"robot_start": 15.0}, seen=False
+            "both arms' tips start off by ±15 mm along each axis", WORLD["robot_start"], seen=False
         ),
     }
 )
@@ -107,8 +102,7 @@ AXES: Mapping[str, Axis] = MappingProxyType(
         ),
     }
 )
-"""Axis → what strength 1 means. The largest kinematic error is that of the surgical robotics
-challenge; the others are ours: at strength 1 the plain image is only just recognisable."""
+"""Axis → what strength 1 means."""
 
 
 def axes_of(spec: "PolicySpec") -> tuple[str, ...]:
@@ -144,12 +138,9 @@ def shifted(spec: "PolicySpec", axis: str, strength: float) -> "PolicySpec":
 
 def shifted_config(config: TaskConfig, axis: Axis, strength: float) -> TaskConfig:
     """Return a task with `strength` of the axis added to its randomisation, up to its limits."""
-    table = dataclasses.asdict(config.randomisation)
-    for name, size in axis.world.items():
-        own = table[name]
-        value = min(own + strength * size, RANDOMISATION_LIMITS[name])
-        table[name] = math.floor(value + 0.5) if isinstance(own, int) else value
-    return dataclasses.replace(config, randomisation=from_mapping(RandomisationConfig, table))
+    return dataclasses.replace(
+        config, randomisation=added(config.randomisation, axis.world, strength)
+    )
 
 
 def _corrupted(make: MakeAgent, kind: str, strength: float) -> Agent:

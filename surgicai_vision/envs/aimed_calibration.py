@@ -1,0 +1,87 @@
+"""Aimed calibration: crops about the jaws as they are, as a detector aims them.
+
+    env.place_crops_by(AimedCalibration(env.simulation, seed))
+
+To train on what a policy sees whose crops a detector aims (docs/detection.md), no detector need
+look at the demonstrations: the simulator knows where the cameras really show the jaws. A crop lies
+there, off by about as much as the released detector is. Its scale is that of the nominal
+calibration, as at an evaluation. K and T_world_camera stay nominal.
+"""
+
+import functools
+import math
+import zlib
+
+import mujoco
+import numpy as np
+
+from surgicai_vision.core.cameras import camera_number
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.calibration import Calibration
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.scene import cameras
+from surgicai_vision.scene.arm import GRASP_DEPTH
+from surgicai_vision.scene.cameras import Window
+from surgicai_vision.scene.crops import NEAREST, whole_size
+
+ERROR = 0.00067
+"""Standard deviation of a crop's place along each of its sides, at the depth of the holes [m]. The
+median distance is then 0.8 mm, that of the released detector (`benchmarks/detector_error.py`)."""
+
+
+class AimedCalibration(Calibration):
+    """The nominal calibration, but for the place of crops; see the module's docstring.
+
+    Args:
+        simulation: the env's.
+        seed: with the state and the view, it decides how far a crop is off.
+    """
+
+    def __init__(self, simulation: Simulation, seed: int):
+        super().__init__(simulation)
+        self._seed = seed
+
+    def window(self, view: str, size: tuple[int, int]) -> Window | None:
+        """Return where a crop of `size` lies in its camera's image; None for a camera.
+
+        Raises:
+            InputError: a crop that is larger than the image it is cut from.
+        """
+        crop = cameras.crop_of(view)
+        if crop is None:
+            return None
+        model = self._simulation.model
+        seen = poses.flat(cameras.extrinsics(model, self._put_true(), crop.camera))
+        jaws = poses.shifted_along_z(self._simulation.tip(crop.arm), GRASP_DEPTH)
+        x, y, z = poses.transform(poses.invert(seen), poses.position(jaws))
+        height, width = size
+        whole, across = whole_size(crop, self._fovy(crop.camera), height, width)
+        fovy = math.radians(float(model.cam_fovy[cameras.camera_id(model, crop.camera)]))
+        scale = whole / 2.0 / math.tan(fovy / 2.0) / max(z, NEAREST)
+        right, down = (error * height / crop.span for error in self._error(view))
+        left = round(scale * x + right + (across - width) / 2.0)
+        top = round(scale * y + down + (whole - height) / 2.0)
+        return Window(
+            min(max(left, 0), across - width), min(max(top, 0), whole - height), whole, across
+        )
+
+    def _error(self, view: str) -> tuple[float, float]:
+        """Return how far to the right and down a crop is off at the present state [m]."""
+        state = zlib.crc32(self._simulation.data.qpos.tobytes())
+        generator = np.random.default_rng((self._seed, state, camera_number(view)))
+        right, down = generator.normal(0.0, ERROR, 2).tolist()
+        return right, down
+
+    @functools.cached_property
+    def _true(self) -> mujoco.MjData:
+        return mujoco.MjData(self._simulation.model)
+
+    def _put_true(self) -> mujoco.MjData:
+        """Return the scene as it is, cameras included."""
+        simulation = self._simulation
+        true = self._true
+        true.qpos[:] = simulation.data.qpos
+        mujoco.mj_kinematics(simulation.model, true)
+        mujoco.mj_comPos(simulation.model, true)
+        mujoco.mj_camlight(simulation.model, true)
+        return true
