@@ -3,26 +3,22 @@
     env.place_crops_by(AimedCalibration(env.simulation, seed))
 
 To train on what a policy sees whose crops a detector aims (docs/detection.md), no detector need
-look at the demonstrations: the simulator knows where the cameras really show the jaws. A crop lies
+look at the demonstrations: the simulator knows where a camera really shows the jaws. A crop lies
 there, off by about as much as the released detector is. Its scale is that of the nominal
 calibration, as at an evaluation. K and T_world_camera stay nominal.
 """
 
-import functools
-import math
 import zlib
 
-import mujoco
 import numpy as np
 
 from surgicai_vision.core.cameras import camera_number
-from surgicai_vision.envs import poses
 from surgicai_vision.envs.calibration import Calibration
+from surgicai_vision.envs.projection import jaws_in_image
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.scene import cameras
-from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.cameras import Window
-from surgicai_vision.scene.crops import NEAREST, whole_size
+from surgicai_vision.scene.crops import whole_size
 
 ERROR = 0.00067
 """Standard deviation of a crop's place along each of its sides, at the depth of the holes [m]. The
@@ -50,17 +46,12 @@ class AimedCalibration(Calibration):
         crop = cameras.crop_of(view)
         if crop is None:
             return None
-        model = self._simulation.model
-        seen = poses.flat(cameras.extrinsics(model, self._put_true(), crop.camera))
-        jaws = poses.shifted_along_z(self._simulation.tip(crop.arm), GRASP_DEPTH)
-        x, y, z = poses.transform(poses.invert(seen), poses.position(jaws))
         height, width = size
         whole, across = whole_size(crop, self._fovy(crop.camera), height, width)
-        fovy = math.radians(float(model.cam_fovy[cameras.camera_id(model, crop.camera)]))
-        scale = whole / 2.0 / math.tan(fovy / 2.0) / max(z, NEAREST)
+        x, y = jaws_in_image(self._simulation, crop.camera, crop.arm, (whole, across))
         right, down = (error * height / crop.span for error in self._error(view))
-        left = round(scale * x + right + (across - width) / 2.0)
-        top = round(scale * y + down + (whole - height) / 2.0)
+        left = round(x * across - width / 2.0 + right)
+        top = round(y * whole - height / 2.0 + down)
         return Window(
             min(max(left, 0), across - width), min(max(top, 0), whole - height), whole, across
         )
@@ -71,17 +62,3 @@ class AimedCalibration(Calibration):
         generator = np.random.default_rng((self._seed, state, camera_number(view)))
         right, down = generator.normal(0.0, ERROR, 2).tolist()
         return right, down
-
-    @functools.cached_property
-    def _true(self) -> mujoco.MjData:
-        return mujoco.MjData(self._simulation.model)
-
-    def _put_true(self) -> mujoco.MjData:
-        """Return the scene as it is, cameras included."""
-        simulation = self._simulation
-        true = self._true
-        true.qpos[:] = simulation.data.qpos
-        mujoco.mj_kinematics(simulation.model, true)
-        mujoco.mj_comPos(simulation.model, true)
-        mujoco.mj_camlight(simulation.model, true)
-        return true

@@ -519,6 +519,9 @@ class Simulation:
     ) -> NDArray[np.float64]:
         """Return a vector of `get_state` with the numbers of some axes of randomisation replaced.
 
+        Nothing moves by it: with another error of the joints, the arms report other joints, and
+        have been told other joints to be where they are.
+
         Args:
             state: a state of this scene.
             given: axis → its numbers, as `randomisation.report` returns them.
@@ -527,8 +530,37 @@ class Simulation:
         first = mujoco.mj_stateSize(self.model, STATE & (_USER_DATA - 1))
         place = slice(first + _DRAWS, first + _WELDS)
         redrawn = np.array(state, dtype=np.float64)
-        redrawn[place] = randomisation.with_numbers(tuple(redrawn[place].tolist()), given)
+        before = tuple(redrawn[place].tolist())
+        after = randomisation.with_numbers(before, given)
+        redrawn[place] = after
+        self._retell(
+            redrawn[first + _COMMANDS : first + _DRAWS],
+            randomisation.joint_offsets(before),
+            randomisation.joint_offsets(after),
+        )
         return redrawn
+
+    def _retell(
+        self,
+        commands: NDArray[np.float64],
+        before: Mapping[str, Sequence[float]],
+        after: Mapping[str, Sequence[float]],
+    ) -> None:
+        """Replace packed commands by those that bring arms of other joint errors to the same place.
+
+        Args:
+            commands: those of both arms, to be changed.
+            before: arm → error of its joints for which they were meant; right where it is missing.
+            after: the same, for which they are meant now.
+        """
+        right = (0.0,) * 6
+        for arm, command in zip(names.ARMS, commands.reshape(-1, COMMAND_SIZE), strict=True):
+            change = np.subtract(before.get(arm, right), after.get(arm, right))
+            if change.any():
+                told = Command.unpack(command.tolist())
+                joints: kinematics.Joints = tuple(np.add(told.joints, change).tolist())
+                pose = kinematics.forward_flat(joints, self.scene.config.instrument)
+                command[:] = Command(pose, told.jaw, joints).pack()
 
     def set_state(self, state: NDArray[np.float64]) -> None:
         """Restore a vector of `get_state`.

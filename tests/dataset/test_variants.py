@@ -9,16 +9,18 @@ from policies.base import Recipe
 from surgicai_vision import envs
 from surgicai_vision.commands import render_demos as command
 from surgicai_vision.commands.console import Console
-from surgicai_vision.core import names
+from surgicai_vision.core import names, shifts
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, schema
 from surgicai_vision.dataset.hub import dataset_card
+from surgicai_vision.dataset.render_jobs import _Shown
 from surgicai_vision.dataset.subset import first_episodes, with_frame_stride
 from surgicai_vision.demos.rollout import EpisodeRecorder
 from surgicai_vision.demos.store import list_demos, read_demo, write_demo, write_marker
+from surgicai_vision.envs.randomisation import UNITS
 from surgicai_vision.training.data import split
 
 STEPS = 2
@@ -98,6 +100,54 @@ def test_a_corruption_of_its_own_lies_on_every_variant_and_on_nothing_else(demos
     assert again.digest == dataset.meta["digest"], "what was recorded decides, not its file"
 
 
+def test_with_a_shift_what_the_arms_report_and_what_is_seen_are_off(demos, tmp_path):
+    shifted = dataclasses.replace(THREE, shift=0.5)
+    render(demos, tmp_path / "own", variants=THREE)
+    render(demos, tmp_path / "off", variants=shifted)
+    own, dataset = open_dataset(tmp_path / "own"), open_dataset(tmp_path / "off")
+    reported = {names.STATE, names.SETPOINT, names.PRIVILEGED_STATE, names.BOTH_ARMS}
+    for key in schema.columns(dataset.views):
+        is_same = np.array_equal(dataset.columns()[key], own.columns()[key])
+        assert is_same != (key in reported), key  # K and T_world_camera stay nominal
+    off = np.abs(dataset.columns()[names.STATE] - own.columns()[names.STATE])[:, :3]
+    assert (off.max(axis=1) > 1e-4).all() and off.max() < 0.03, "the pose, in metres"
+    assert len(np.unique(off.reshape(6, -1)[:, 0])) == 6, "each variant has its own error"
+    images, before = (d.frames("front").astype(int) for d in (dataset, own))
+    assert (np.abs(images - before).mean(axis=(1, 2, 3)) > 5).all()
+    assert dataset.config == own.config, "a policy is evaluated where nothing is off"
+    assert check_dataset(dataset.path).ok
+
+
+@pytest.mark.parametrize("strength", [0.2, 1.0])
+def test_a_shift_goes_as_far_as_robustness_at_its_strength(demos, strength):
+    demo = read_demo(list_demos(demos)[0])
+    drawn = [_Shown.drawn(Variants(shift=strength), demo, variant).look for variant in range(40)]
+    assert drawn[0].keys() == shifts.RENDERED.keys()
+    for name, size in shifts.RENDERED.items():
+        shares = np.array([look[name] for look in drawn]) / (size * np.array(UNITS[name]))
+        assert np.abs(shares).max() <= strength
+        assert np.abs(shares).max() > 0.8 * strength
+
+
+def test_aimed_crops_are_drawn_about_the_jaws(demos, tmp_path):
+    """In every env that a process keeps: a dataset without aimed crops is as it was before."""
+    plain, aimed = Variants("train"), Variants("train", aimed=True)
+    for name, looks in (("before", plain), ("aimed", aimed), ("after", plain)):
+        render_demos(
+            demos,
+            tmp_path / name,
+            views=("front_psm2", "front"),
+            size=64,
+            context=RunContext(0),
+            variants=looks,
+        )
+    before, aimed, after = (open_dataset(tmp_path / name) for name in ("before", "aimed", "after"))
+    assert before.meta["digest"] == after.meta["digest"] != aimed.meta["digest"]
+    np.testing.assert_array_equal(aimed.frames("front"), before.frames("front"))
+    assert (aimed.frames("front_psm2") != before.frames("front_psm2")).any()
+    assert check_dataset(aimed.path).ok
+
+
 def test_splits_and_counts_go_by_the_demonstration(dataset):
     np.testing.assert_array_equal(dataset.demonstration_index, np.repeat([0, 1], 3 * STEPS))
     assert len(dataset.bounds()) == 6
@@ -152,6 +202,17 @@ def test_refuses_variants_without_a_look():
         Variants("train", count=0)
     with pytest.raises(InputError, match="appearance"):
         Variants("mud")
+    for amount in (-0.1, 1.1):
+        with pytest.raises(InputError, match="shift"):
+            Variants(shift=amount)
+    assert Variants(shift=0.5).name == "shift0.5-x1"
+    assert Variants("train", corruption=0.5, shift=0.5, aimed=True).request == {
+        "appearance": "train",
+        "corruption": 0.5,
+        "shift": 0.5,
+        "aimed": True,
+        "count": 1,
+    }
 
 
 def test_the_command_renders_variants(demos, tmp_path):

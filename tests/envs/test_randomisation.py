@@ -244,6 +244,39 @@ def test_an_arc_is_named_by_its_number(choice, allowed):
     assert drawn == set(allowed)
 
 
+def test_an_error_that_is_drawn_anew_moves_nothing():
+    """Where the arms are and are told to be stays; what they report is off by the difference."""
+    error = RandomisationConfig(kinematic_error=0.5)
+    env = made("place", kinematic_error=0.5)
+    simulation = env.simulation
+    env.reset(seed=3)
+    for _ in range(5):
+        env.step(np.array([0.5, -0.5, 0.5, 0.2, 0.1, -0.3, -1], np.float32))
+    state = simulation.get_state()
+
+    def seen():
+        where = [
+            (simulation.tip(arm), simulation.true_pose(arm, simulation.commands[arm]))
+            for arm in names.ARMS
+        ]
+        return np.array(where), {arm: simulation.reported_joints(arm) for arm in names.ARMS}
+
+    (where, reported), offsets = seen(), simulation.offsets
+    others = {
+        axis: numbers.tolist() for axis, numbers in randomisation.drawn(error, seed=8).items()
+    }
+    env.set_state_vector(simulation.redrawn(state, others))
+    (moved, now), after = seen(), simulation.offsets
+    np.testing.assert_allclose(moved, where, atol=1e-9)
+    for arm in names.ARMS:
+        change = np.subtract(offsets[arm], after[arm])
+        assert np.abs(change[:3]).min() > 1e-4
+        np.testing.assert_allclose(np.subtract(now[arm], reported[arm]), change, atol=1e-12)
+    back = {"kinematic_error": [*offsets["psm1"][:3], *offsets["psm2"][:3]]}
+    env.set_state_vector(simulation.redrawn(simulation.get_state(), back))
+    np.testing.assert_allclose(simulation.get_state(), state, atol=1e-9)
+
+
 def test_the_phantom_moves_with_its_goals():
     plain, moved = made("place"), made("place", phantom_shift=2.0)
     _, info = moved.reset(seed=1)

@@ -14,6 +14,8 @@ from surgicai_vision.detection.card import RELEASED, DetectorCard, detector_fold
 from surgicai_vision.detection.detector import write_detector
 from surgicai_vision.detection.examples import PART, WHOLE
 from surgicai_vision.detection.network import JawNetwork
+from surgicai_vision.envs import aimed_calibration
+from surgicai_vision.envs.aimed_calibration import AimedCalibration
 from surgicai_vision.envs.projection import jaws_in_image
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.aimed_agent import AimedAgent, aimed, cut, middle
@@ -119,6 +121,45 @@ def test_crops_follow_the_jaws_where_cameras_and_joints_are_off():
                 cut(observation[crop.camera], crop, place.astype(np.float32), (SIDE, SIDE)),
             )
     assert detector.asked == ["front", "back"] * 3  # one look per camera, whatever the arms
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_demonstrations_are_rendered_as_an_aimed_agent_sees_them(view, monkeypatch):
+    """Apart from the detector's error, whatever is off: the same part at the same scale."""
+    off = RandomisationConfig(
+        camera_shift=5.0, camera_turn=5.0, camera_fovy=5.0, kinematic_error=0.5
+    )
+    env = envs.make(TaskConfig("place", randomisation=off))
+    env.reset(seed=names.VALIDATION_SEED)
+    crop = crop_of(view)
+    place = np.array(jaws_in_image(env.simulation, crop.camera, crop.arm, WHOLE), np.float32)
+    whole = env.image(crop.camera, WHOLE)
+    at_place, aside = (cut(whole, crop, place + off, (SIDE, SIDE)) for off in (0.0, 0.01))
+    monkeypatch.setattr(aimed_calibration, "ERROR", 0.0)
+    env.place_crops_by(AimedCalibration(env.simulation, 0))
+    rendered = env.image(view, (SIDE, SIDE))
+    assert differ(at_place, rendered) < 0.6 * differ(aside, rendered)
+    assert differ(at_place, rendered) < 4
+
+
+def test_an_aimed_crop_is_off_by_as_much_as_a_detector():
+    env = envs.make(TaskConfig("place"))
+    size = (SIDE, SIDE)
+    errors = []
+    for seed in range(40):
+        env.reset(seed=seed)
+        for view in VIEWS:
+            found = AimedCalibration(env.simulation, 7)
+            window = found.window(view, size)
+            assert window == found.window(view, size), "the same state has the same error"
+            true = env.calibration.window(view, size)  # nothing is off here
+            pixel = crop_of(view).span / SIDE
+            errors.append(pixel * np.subtract((window.left, window.top), (true.left, true.top)))
+    spread = np.std(errors)
+    assert 0.8 * aimed_calibration.ERROR < spread < 1.3 * aimed_calibration.ERROR
+    assert abs(np.mean(errors)) < 0.2 * aimed_calibration.ERROR
+    assert len(np.unique(errors, axis=0)) > 10
+    assert AimedCalibration(env.simulation, 7).window("front", size) is None
 
 
 def test_an_aimed_agent_asks_for_whole_images_and_says_so():
