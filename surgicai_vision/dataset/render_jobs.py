@@ -35,7 +35,6 @@ from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, column_ar
 from surgicai_vision.demos.store import Demo, read_demo
 from surgicai_vision.envs import randomisation
 from surgicai_vision.envs.aimed_calibration import AimedCalibration
-from surgicai_vision.envs.calibration import Calibration
 from surgicai_vision.envs.looks import draw as draw_look
 from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.rendering import renderer_string
@@ -55,9 +54,12 @@ def _calibration(env: envs.SuturingEnv, view: str, size: int) -> dict[str, NDArr
 
 @functools.lru_cache(maxsize=1)
 def _env(
-    config: str, views: tuple[str, ...], size: int, depth: bool, segmentation: bool
+    config: str, views: tuple[str, ...], size: int, depth: bool, segmentation: bool, aimed: bool
 ) -> envs.SuturingEnv:
-    """Return this process's environment; the previous one is closed with its GL context."""
+    """Return this process's environment; the previous one is closed with its GL context.
+
+    One whose crops are aimed serves no others, for it keeps the place of its crops.
+    """
     # The GL context must be freed before the interpreter exits.
     atexit.register(_env.cache_clear)
     return envs.make(
@@ -91,7 +93,8 @@ def render_episode(
     episode = read_demo(Path(demo))
     looks = from_mapping(Variants, variants) if variants else None
     config = _rendered_in(looks, episode.config) if looks else episode.config
-    env = _env(json.dumps(to_mapping(config)), tuple(views), size, depth, segmentation)
+    is_aimed = looks is not None and looks.aimed
+    env = _env(json.dumps(to_mapping(config)), tuple(views), size, depth, segmentation, is_aimed)
     if env.scene.hash != episode.scene_hash:
         raise BadFile(
             f"{demo} was recorded in another scene (hash {episode.scene_hash[:12]}, now "
@@ -106,10 +109,8 @@ def render_episode(
         key: [] for key in (*chosen.measured, *schema.calibration_keys(views))
     }
     shown = _Shown.drawn(looks, episode, variant) if looks else _Shown()
-    is_aimed = looks is not None and looks.aimed
-    env.place_crops_by(
-        AimedCalibration(env.simulation, shown.seed) if is_aimed else Calibration(env.simulation)
-    )
+    if is_aimed:
+        env.place_crops_by(AimedCalibration(env.simulation, shown.seed))
     for step, state in enumerate(episode.state[:-1:frame_stride]):
         env.set_state_vector(env.simulation.redrawn(state, shown.look) if shown.look else state)
         observation = env.observe()

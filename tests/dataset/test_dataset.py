@@ -53,8 +53,8 @@ SIZE = 32
 def fake(monkeypatch):
     """Render with the stand-in environment, in this process."""
 
-    def env(config, views, size, depth, segmentation):
-        return FakeEnv(CONFIG, views, size, depth, segmentation)
+    def env(config, *rest):
+        return FakeEnv(CONFIG, *rest)
 
     monkeypatch.setattr(render_jobs, "_env", env)
     monkeypatch.setattr(render_jobs, "_renderer", lambda: "none")

@@ -52,6 +52,7 @@ class FakeEnv:
         image_size=32,
         depth=False,
         segmentation=False,
+        aimed=False,
         **_,
     ):
         self.config = config or TaskConfig(max_steps=12)
