@@ -118,17 +118,14 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             "--task, --episodes, --seed and env say what to record; with --demos DIR nothing is "
             "recorded."
         )
-    variants = None
-    drawn = (options.appearance, options.distractors, options.corruption)
-    if any((*drawn, options.shift, options.aimed)) or options.variants > 1:
-        variants = Variants(
-            options.appearance or "",
-            options.distractors or 0,
-            options.variants,
-            options.corruption,
-            options.shift,
-            options.aimed,
-        )
+    variants = Variants.asked(
+        options.appearance or "",
+        options.distractors or 0,
+        options.variants,
+        options.corruption,
+        options.shift,
+        options.aimed,
+    )
     task = folders.demos_task(options.demos[0]) if options.demos else options.task or "grasp"
     of_others = "" if options.layout == "surgicai" else f"-{options.layout}"
     out = options.out or folders.dataset_folder(f"{task}{of_others}")

@@ -54,19 +54,31 @@ class Variants:
         for name in ("corruption", "shift"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{name} is {getattr(self, name)}; allowed: 0 to 1.")
-        if not self.draws:
+        if not (self.appearance or self.distractors or self.corruption or self.shift or self.aimed):
             raise InputError(
                 f"{self.count} variants are requested without a look to draw; give an appearance "
                 "(--appearance train), distractors (--distractors 5), a corruption (--corruption "
                 "0.5), a shift (--shift 0.5) or --aimed."
             )
 
-    @property
-    def draws(self) -> bool:
-        """Whether anything is drawn for a variant."""
-        return bool(
-            self.appearance or self.distractors or self.corruption or self.shift or self.aimed
-        )
+    @classmethod
+    def asked(
+        cls,
+        appearance: str,
+        distractors: int,
+        count: int,
+        corruption: float,
+        shift: float,
+        aimed: bool,
+    ) -> "Variants | None":
+        """Return the variants; None for one in which nothing is drawn: each as it was recorded.
+
+        Raises:
+            InputError, UnknownName: as the class does.
+        """
+        if count == 1 and not (appearance or distractors or corruption or shift or aimed):
+            return None
+        return cls(appearance, distractors, count, corruption, shift, aimed)
 
     def shown(self, config: TaskConfig) -> TaskConfig:
         """Return the task as it looks in the variants, corruption and shift aside."""

@@ -184,7 +184,9 @@ class _Shown:
         look = {**draw_look(looks.shown(TaskConfig()).randomisation, rng)}
         if looks.shift:
             off = shifts.added(RandomisationConfig(), shifts.RENDERED, looks.shift)
-            numbers = randomisation.report(off, randomisation.draw(off, rng.spawn(1)[0]))
+            numbers = randomisation.report(
+                off, randomisation.draw(off, randomisation.generator(rng))
+            )
             look |= {axis: np.atleast_1d(drawn).tolist() for axis, drawn in numbers.items()}
         strengths = {kind: looks.corruption * rng.random() for kind in CORRUPTIONS}
         return cls(look, strengths if looks.corruption else {}, int(rng.integers(2**32)))

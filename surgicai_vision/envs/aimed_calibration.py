@@ -16,9 +16,8 @@ from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.envs.calibration import Calibration
 from surgicai_vision.envs.projection import jaws_in_image
 from surgicai_vision.envs.simulation import Simulation
-from surgicai_vision.scene import cameras
-from surgicai_vision.scene.cameras import Window
-from surgicai_vision.scene.crops import whole_size
+from surgicai_vision.scene.cameras import Crop, Window
+from surgicai_vision.scene.crops import whole_size, window_at
 
 ERROR = 0.00067
 """Standard deviation of a crop's place along each of its sides, at the depth of the holes [m]. The
@@ -37,24 +36,15 @@ class AimedCalibration(Calibration):
         super().__init__(simulation)
         self._seed = seed
 
-    def window(self, view: str, size: tuple[int, int]) -> Window | None:
-        """Return where a crop of `size` lies in its camera's image; None for a camera.
-
-        Raises:
-            InputError: a crop that is larger than the image it is cut from.
-        """
-        crop = cameras.crop_of(view)
-        if crop is None:
-            return None
+    def _window_of(self, crop: Crop, view: str, size: tuple[int, int]) -> Window:
+        """Return where a view that is a crop lies: about the jaws as a detector would see them."""
         height, width = size
         whole, across = whole_size(crop, self._fovy(crop.camera), height, width)
         x, y = jaws_in_image(self._simulation, crop.camera, crop.arm, (whole, across))
         right, down = (error * height / crop.span for error in self._error(view))
-        left = round(x * across - width / 2.0 + right)
-        top = round(y * whole - height / 2.0 + down)
-        return Window(
-            min(max(left, 0), across - width), min(max(top, 0), whole - height), whole, across
-        )
+        left = x * across - width / 2.0 + right
+        top = y * whole - height / 2.0 + down
+        return window_at(left, top, size, (whole, across))
 
     def _error(self, view: str) -> tuple[float, float]:
         """Return how far to the right and down a crop is off at the present state [m]."""

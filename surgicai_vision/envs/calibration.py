@@ -21,7 +21,7 @@ from surgicai_vision.envs import poses
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.scene import cameras
 from surgicai_vision.scene.arm import GRASP_DEPTH
-from surgicai_vision.scene.cameras import Window
+from surgicai_vision.scene.cameras import Crop, Window
 from surgicai_vision.scene.crops import window_about
 from surgicai_vision.scene.kinematics import Pose
 
@@ -51,8 +51,10 @@ class Calibration:
             InputError: a crop that is larger than the image it is cut from.
         """
         crop = cameras.crop_of(view)
-        if crop is None:
-            return None
+        return None if crop is None else self._window_of(crop, view, size)
+
+    def _window_of(self, crop: Crop, view: str, size: tuple[int, int]) -> Window:
+        """Return where a view that is a crop lies: about the jaws as its arm reports them."""
         grasp = poses.position(self.reported_grasp(crop.arm))
         in_camera = poses.transform(poses.invert(self._pose(crop.camera)), grasp)
         return window_about(crop, in_camera, self._fovy(crop.camera), *size)

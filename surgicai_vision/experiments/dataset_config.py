@@ -115,10 +115,7 @@ class Demonstrations:
     @property
     def looks(self) -> Variants | None:
         """The looks each is rendered in; None keeps the recorded look."""
-        drawn = (self.appearance, self.distractors, self.corruption, self.shift, self.aimed)
-        if not any(drawn) and self.variants == 1:
-            return None
-        return Variants(
+        return Variants.asked(
             self.appearance,
             self.distractors,
             self.variants,

@@ -2,6 +2,7 @@
 
     whole = whole_size(crop, fovy, 224, 224)          # height and width of the whole image [pixel]
     window = window_about(crop, point_in_camera, fovy, 224, 224)
+    window = window_at(left, top, (224, 224), whole)  # where its corner is known
     renderer.render(data, crop.camera, "rgb", window)
 
 The whole image is so large that `crop.span` at `crop.distance` covers the crop's height. The window
@@ -103,8 +104,19 @@ def window_about(crop: Crop, point: Vector, fovy: float, height: int, width: int
     focal = whole / 2.0 / math.tan(fovy / 2.0)
     x, y, z = point
     scale = focal / max(z, NEAREST)
-    left = round(scale * x + (across - width) / 2.0)
-    top = round(scale * y + (whole - height) / 2.0)
-    return Window(
-        min(max(left, 0), across - width), min(max(top, 0), whole - height), whole, across
-    )
+    left = scale * x + (across - width) / 2.0
+    top = scale * y + (whole - height) / 2.0
+    return window_at(left, top, (height, width), (whole, across))
+
+
+def window_at(left: float, top: float, size: tuple[int, int], whole: tuple[int, int]) -> Window:
+    """Return the window of a crop, rounded to whole pixels and kept inside the image.
+
+    Args:
+        left: where its left edge should be in the whole image [pixel].
+        top: the same of its upper edge [pixel].
+        size: height and width of the crop [pixel].
+        whole: height and width of the whole image [pixel], not smaller.
+    """
+    lowest, rightmost = (of - part for of, part in zip(whole, size, strict=True))
+    return Window(min(max(round(left), 0), rightmost), min(max(round(top), 0), lowest), *whole)

@@ -26,7 +26,7 @@ STARTS = 60
 
 
 def store(folder, succeeds, *, seeds=(0,), world=WORLD):
-    """Store an evaluation per training seed; `succeeds(drawn, seed)` says which starts succeed."""
+    """Store an evaluation per training seed; `succeeds(seed)` says which starts succeed."""
     for training_seed in seeds:
         config = TaskConfig("grasp", randomisation=world)
         run = replace(run_of("grasp", "imagenet", ("back",), training_seed), env=config)
