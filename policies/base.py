@@ -98,6 +98,8 @@ class Recipe:
             everywhere, or multiplies it by, then does not reach the head.
         speed: share of each action that is executed, above 0 and at most 1; the clock runs as much
             slower. It does not affect what is learned (docs/evaluation.md).
+        jaw_speed: share of the jaw's motion that is executed besides, above 0 and at most 1. Does
+            not affect what is learned either.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -121,6 +123,7 @@ class Recipe:
     map_shift: int = 0
     instance_norm: bool = field(default=False, metadata=LATER)
     speed: float = field(default=1.0, metadata=LATER)
+    jaw_speed: float = field(default=1.0, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_finite(**{key: of for key, of in vars(self).items() if isinstance(of, float)})
@@ -168,8 +171,9 @@ class Recipe:
             )
         if not 0 <= self.validation < 1:
             raise InputError(f"validation is {self.validation}; give a share from 0 to below 1.")
-        if not 0 < self.speed <= 1:
-            raise InputError(f"speed is {self.speed}; give a share above 0, at most 1.")
+        for key in ("speed", "jaw_speed"):
+            if not 0 < getattr(self, key) <= 1:
+                raise InputError(f"{key} is {getattr(self, key)}; give a share above 0, at most 1.")
 
 
 @dataclass(frozen=True)
@@ -282,6 +286,7 @@ class Policy(nn.Module, abc.ABC):
         input_std: standard deviation of each, 1 where an input is constant.
         checkpoint: the checkpoint that a loaded policy was restored from.
         speed: share of each of its actions that is executed, as its recipe has it.
+        jaw_speed: share of the jaw's motion that is executed besides, as its recipe has it.
         history: number of observations it sees, the present one last.
         averaging: largest decay of the moving average of its weights in training; the average is
             what is kept. 0 keeps the weights themselves.
@@ -289,6 +294,7 @@ class Policy(nn.Module, abc.ABC):
     """
 
     speed: float = 1.0
+    jaw_speed: float = 1.0
     history: int = 1
     averaging: float = 0.0
     clip: float = 0.0

@@ -52,8 +52,11 @@ class HLPRecipe(Recipe):
         for name in ("privileged", "setpoint", "progress_input"):
             if getattr(self, name):
                 raise InputError(f"Policy 'hlp' sees both arms and images; leave '{name}' off.")
-        if self.speed != 1:
-            raise InputError("Policy 'hlp' chooses subtasks and does not move; leave 'speed' at 1.")
+        for key in ("speed", "jaw_speed"):
+            if getattr(self, key) != 1:
+                raise InputError(
+                    f"Policy 'hlp' chooses subtasks and does not move; leave '{key}' at 1."
+                )
 
 
 @final

@@ -190,6 +190,7 @@ class PolicyAgent(Agent):
         progress: predicts the progress, for a policy with `names.PROGRESS` as an input.
         action_repeat: control steps for which an action was held in its training.
         speed: share of each action that is executed; its clock runs as much slower.
+        jaw_speed: share of the jaw's motion that is executed besides.
     """
 
     def __init__(
@@ -203,6 +204,7 @@ class PolicyAgent(Agent):
         progress: "PolicyAgent | None" = None,
         action_repeat: int = 1,
         speed: float = 1.0,
+        jaw_speed: float = 1.0,
     ):
         self.name = name
         self.views = views
@@ -218,6 +220,7 @@ class PolicyAgent(Agent):
         self._progress = progress
         self.action_repeat = action_repeat
         self.speed = speed
+        self.executed = np.array([speed] * 6 + [speed * jaw_speed], np.float32)
         self._ticks: dict[int, int] = {}
         self._shared: FeatureTable | None = None
 
@@ -238,10 +241,10 @@ class PolicyAgent(Agent):
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the policy's actions (n, 7), at its speed."""
+        """Return the policy's actions (n, 7), at its speeds."""
         ticks = [self._ticks[slot] for slot in slots]
         self._ticks.update({slot: tick + 1 for slot, tick in zip(slots, ticks, strict=True)})
-        return self.answer(robots, observations, ticks) * np.float32(self.speed)
+        return self.answer(robots, observations, ticks) * self.executed
 
     def answer(
         self,

@@ -414,6 +414,7 @@ def _agent_of(policy: "Policy", weights: WeightsSource) -> PolicyAgent:
         policy_agent(progress, weights) if progress else None,
         checkpoint.task.action_repeat,
         policy.speed,
+        policy.jaw_speed,
     )
 
 

@@ -31,8 +31,8 @@ TERMINATIONS = ("privileged", "learned")
 """How a subtask ends under a hierarchical policy."""
 BUDGET = "minutes"
 """Recipe setting that limits the training time (`policies.chunks.ChunkRecipe`)."""
-ACTED_BY = ("speed", "execute", "samples", "ensemble")
-"""Settings of a recipe that do not affect what is learned: speed, and how chunks are executed."""
+ACTED_BY = ("speed", "jaw_speed", "execute", "samples", "ensemble")
+"""Settings of a recipe that do not affect what is learned: speeds, and how chunks are executed."""
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,8 @@ def test_inputs_that_it_does_not_read_are_refused(name: str) -> None:
 def test_a_speed_is_refused() -> None:
     with pytest.raises(InputError, match="leave 'speed' at 1"):
         HLPRecipe(speed=0.5)
+    with pytest.raises(InputError, match="leave 'jaw_speed' at 1"):
+        HLPRecipe(jaw_speed=0.5)
 
 
 def test_without_progress_it_is_the_policy_it_was(tmp_path: Path) -> None:

@@ -451,11 +451,12 @@ def test_a_recipe_without_instance_norm_keeps_its_identity() -> None:
     assert to_identity(Recipe(instance_norm=True))["instance_norm"] is True
 
 
-def test_a_recipe_at_full_speed_keeps_its_identity() -> None:
-    assert "speed" not in to_identity(Recipe())
-    for wrong in (0.0, -0.5, 1.5):
-        with pytest.raises(InputError, match="speed is"):
-            Recipe(speed=wrong)
+@pytest.mark.parametrize("key", ["speed", "jaw_speed"])
+def test_a_recipe_at_full_speed_keeps_its_identity(key: str) -> None:
+    assert key not in to_identity(Recipe())
+    for wrong in (0.0, -0.5, 1.5, float("nan")):
+        with pytest.raises(InputError, match=f"^{key} is"):
+            Recipe(**{key: wrong})  # type: ignore[arg-type]
 
 
 def test_recipes_name_how_maps_are_taken_in_and_how_many_frames() -> None:
