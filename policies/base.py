@@ -26,7 +26,14 @@ from numpy.typing import NDArray
 from torch import nn
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE, LATER, check_hidden
+from surgicai_vision.core.config import (
+    CLOCK_PERIOD,
+    CLOCK_SIZE,
+    FULL_SPEED,
+    LATER,
+    Pace,
+    check_hidden,
+)
 from surgicai_vision.core.errors import (
     InputError,
     check_at_least,
@@ -97,9 +104,8 @@ class Recipe:
             (Ulyanov et al., Instance normalization, 2016): what a look adds to a channel
             everywhere, or multiplies it by, then does not reach the head.
         speed: share of each action that is executed, above 0 and at most 1; the clock runs as much
-            slower. It does not affect what is learned (docs/evaluation.md).
-        jaw_speed: share of the jaw's motion that is executed besides, above 0 and at most 1. Does
-            not affect what is learned either.
+            slower. It does not affect what is learned (docs/evaluation.md); see `Pace`.
+        jaw_speed, clock_speed: see `Pace`; they do not affect what is learned either.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -124,6 +130,7 @@ class Recipe:
     instance_norm: bool = field(default=False, metadata=LATER)
     speed: float = field(default=1.0, metadata=LATER)
     jaw_speed: float = field(default=1.0, metadata=LATER)
+    clock_speed: float = field(default=1.0, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_finite(**{key: of for key, of in vars(self).items() if isinstance(of, float)})
@@ -171,9 +178,12 @@ class Recipe:
             )
         if not 0 <= self.validation < 1:
             raise InputError(f"validation is {self.validation}; give a share from 0 to below 1.")
-        for key in ("speed", "jaw_speed"):
-            if not 0 < getattr(self, key) <= 1:
-                raise InputError(f"{key} is {getattr(self, key)}; give a share above 0, at most 1.")
+        _ = self.pace
+
+    @property
+    def pace(self) -> Pace:
+        """How fast a policy of this recipe acts."""
+        return Pace(self.speed, self.jaw_speed, self.clock_speed)
 
 
 @dataclass(frozen=True)
@@ -285,16 +295,14 @@ class Policy(nn.Module, abc.ABC):
         input_mean: mean of each input over the training frames, (inputs.dim,).
         input_std: standard deviation of each, 1 where an input is constant.
         checkpoint: the checkpoint that a loaded policy was restored from.
-        speed: share of each of its actions that is executed, as its recipe has it.
-        jaw_speed: share of the jaw's motion that is executed besides, as its recipe has it.
+        pace: how fast it acts, as its recipe has it.
         history: number of observations it sees, the present one last.
         averaging: largest decay of the moving average of its weights in training; the average is
             what is kept. 0 keeps the weights themselves.
         clip: gradient norm limit in training; 0 disables clipping.
     """
 
-    speed: float = 1.0
-    jaw_speed: float = 1.0
+    pace: Pace = FULL_SPEED
     history: int = 1
     averaging: float = 0.0
     clip: float = 0.0

@@ -52,8 +52,8 @@ class HLPRecipe(Recipe):
         for name in ("privileged", "setpoint", "progress_input"):
             if getattr(self, name):
                 raise InputError(f"Policy 'hlp' sees both arms and images; leave '{name}' off.")
-        for key in ("speed", "jaw_speed"):
-            if getattr(self, key) != 1:
+        for key, share in vars(self.pace).items():
+            if share != 1:
                 raise InputError(
                     f"Policy 'hlp' chooses subtasks and does not move; leave '{key}' at 1."
                 )

@@ -523,3 +523,42 @@ def clock(steps: "NDArray[np.int64] | NDArray[np.float64]") -> "NDArray[np.float
 
     turn = 2.0 * np.pi * steps / CLOCK_PERIOD
     return np.stack([steps / SUBTASK_STEPS, np.sin(turn), np.cos(turn)], axis=1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast a policy acts: shares of what it answers, each above 0 and at most 1.
+
+    Where actions take effect late, a policy at full speed swings about its goal, its jaws swing
+    open and closed, and its clock says that it is there before it is (docs/evaluation.md).
+
+    Attributes:
+        speed: share of each action that is executed; the clock runs as much slower.
+        jaw_speed: share of the jaw's motion that is executed besides.
+        clock_speed: how much slower the clock runs besides.
+    """
+
+    speed: float = 1.0
+    jaw_speed: float = 1.0
+    clock_speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        for key, share in vars(self).items():
+            if not 0 < share <= 1:
+                raise InputError(f"{key} is {share}; give a share above 0, at most 1.")
+
+    @property
+    def executed(self) -> "NDArray[np.float32]":
+        """Share of each of an action's values that is executed, (7,)."""
+        import numpy as np  # not at the top, as in `clock`
+
+        return np.array([self.speed] * 6 + [self.speed * self.jaw_speed], np.float32)
+
+    @property
+    def clock(self) -> float:
+        """Control steps by which the clock advances in one."""
+        return self.speed * self.clock_speed
+
+
+FULL_SPEED = Pace()
+"""The pace of a policy that acts as it answers."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import clock
+from surgicai_vision.core.config import FULL_SPEED, Pace, clock
 from surgicai_vision.core.errors import UnreachablePose
 from surgicai_vision.demos.demonstrator import make_demonstrator
 from surgicai_vision.evaluation.agent import (
@@ -189,8 +189,7 @@ class PolicyAgent(Agent):
         vector: its inputs besides features, keys of `policies.base.VECTORS`.
         progress: predicts the progress, for a policy with `names.PROGRESS` as an input.
         action_repeat: control steps for which an action was held in its training.
-        speed: share of each action that is executed; its clock runs as much slower.
-        jaw_speed: share of the jaw's motion that is executed besides.
+        pace: how fast it acts.
     """
 
     def __init__(
@@ -203,8 +202,7 @@ class PolicyAgent(Agent):
         vector: tuple[str, ...] = (names.STATE,),
         progress: "PolicyAgent | None" = None,
         action_repeat: int = 1,
-        speed: float = 1.0,
-        jaw_speed: float = 1.0,
+        pace: Pace = FULL_SPEED,
     ):
         self.name = name
         self.views = views
@@ -219,8 +217,7 @@ class PolicyAgent(Agent):
         self._clocked = names.CLOCK in vector
         self._progress = progress
         self.action_repeat = action_repeat
-        self.speed = speed
-        self.executed = np.array([speed] * 6 + [speed * jaw_speed], np.float32)
+        self.pace = pace
         self._ticks: dict[int, int] = {}
         self._shared: FeatureTable | None = None
 
@@ -241,10 +238,10 @@ class PolicyAgent(Agent):
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the policy's actions (n, 7), at its speeds."""
+        """Return the policy's actions (n, 7), at its pace."""
         ticks = [self._ticks[slot] for slot in slots]
         self._ticks.update({slot: tick + 1 for slot, tick in zip(slots, ticks, strict=True)})
-        return self.answer(robots, observations, ticks) * self.executed
+        return self.answer(robots, observations, ticks) * self.pace.executed
 
     def answer(
         self,
@@ -274,7 +271,7 @@ class PolicyAgent(Agent):
             [np.concatenate([told(robot) for told in self._told]) for robot in robots]
         )
         if self._clocked and ticks is not None:
-            clocks = clock(np.array(ticks) * self.action_repeat * self.speed)
+            clocks = clock(np.array(ticks) * self.action_repeat * self.pace.clock)
             vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)
         if self._progress is not None:
             said = self._progress.answer(robots, observations)[:, PROGRESS_AT:]

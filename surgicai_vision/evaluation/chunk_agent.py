@@ -99,7 +99,7 @@ class ChunkAgent(Agent):
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the planned actions of this step (n, 7), at the policy's speeds."""
+        """Return the planned actions of this step (n, 7), at the policy's pace."""
         episodes = [self._episodes[slot] for slot in slots]
         with one_thread():
             ticks = [episode.tick for episode in episodes]
@@ -111,7 +111,7 @@ class ChunkAgent(Agent):
         actions = [self._action(episode) for episode in episodes]
         for episode in episodes:
             episode.tick += 1
-        return np.stack(actions) * self._senses.executed
+        return np.stack(actions) * self._senses.pace.executed
 
     def _is_due(self, tick: int) -> bool:
         """Return True if a plan is made at `tick`: every `execute` actions, from 0 on."""

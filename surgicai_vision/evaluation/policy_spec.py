@@ -413,8 +413,7 @@ def _agent_of(policy: "Policy", weights: WeightsSource) -> PolicyAgent:
         policy.inputs.vector or (names.STATE,),
         policy_agent(progress, weights) if progress else None,
         checkpoint.task.action_repeat,
-        policy.speed,
-        policy.jaw_speed,
+        policy.pace,
     )
 
 

@@ -264,7 +264,7 @@ def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> 
         ) from None
     policy.eval().requires_grad_(False)
     policy.checkpoint = checkpoint
-    policy.speed, policy.jaw_speed = recipe.speed, recipe.jaw_speed
+    policy.pace = recipe.pace
     return policy
 
 

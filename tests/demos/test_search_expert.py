@@ -17,6 +17,7 @@ from surgicai_vision.core.config import (
     CLOCK_PERIOD,
     CLOCK_SIZE,
     SUBTASK_STEPS,
+    Pace,
     RandomisationConfig,
     TaskConfig,
     clock,
@@ -142,31 +143,30 @@ def test_a_policy_with_a_clock_acts_by_it(tmp_path: Path) -> None:
     held = PolicyAgent("held", policy, None, (), 224, policy.inputs.vector, action_repeat=2)
     held.reset(0, Still(), 0)
     assert [held.act([0], [Still()], [None])[0, 0] for _ in range(20)] == early[::2]
-    slow = PolicyAgent("slow", policy, None, (), 224, policy.inputs.vector, speed=0.5)
+    slow = PolicyAgent("slow", policy, None, (), 224, policy.inputs.vector, pace=Pace(speed=0.5))
     slow.reset(0, Still(), 0)
     halves = [slow.act([0], [Still()], [None])[0, 0] for _ in range(40)][::2]
     np.testing.assert_array_equal(halves, np.float32(0.5) * np.array(early[:20]))
 
 
-def test_a_slow_jaw_changes_neither_the_motion_nor_the_clock(tmp_path: Path) -> None:
+def test_the_jaw_and_the_clock_are_slowed_on_their_own(tmp_path: Path) -> None:
     recipe = Recipe(hidden=(32,), epochs=60, batch_size=32, learning_rate=1e-2, clock=True)
     train(Stepped(), [], BC, recipe, out=tmp_path / "clocked")
-    assert load_policy(tmp_path / "clocked", {"jaw_speed": 0.25}).jaw_speed == 0.25
-    policy = load_policy(tmp_path / "clocked")
-    acted = {}
-    for speed, jaw_speed in ((1.0, 1.0), (1.0, 0.25), (0.5, 1.0), (0.5, 0.25)):
-        agent = PolicyAgent(
-            "a", policy, None, (), 224, policy.inputs.vector, speed=speed, jaw_speed=jaw_speed
-        )
+    policy = load_policy(tmp_path / "clocked", {"jaw_speed": 0.25, "clock_speed": 0.5})
+    assert policy.pace == Pace(jaw_speed=0.25, clock_speed=0.5)
+
+    def acted(pace: Pace) -> np.ndarray:
+        agent = PolicyAgent("a", policy, None, (), 224, policy.inputs.vector, pace=pace)
         agent.reset(0, Still(), 0)
-        acted[speed, jaw_speed] = np.array(
-            [agent.act([0], [Still()], [None])[0] for _ in range(40)]
-        )
-    assert np.abs(acted[1.0, 1.0][:, 6]).min() > 0
+        return np.array([agent.act([0], [Still()], [None])[0] for _ in range(40)])
+
     for speed in (1.0, 0.5):
-        whole, slow = acted[speed, 1.0], acted[speed, 0.25]
+        whole, slow = acted(Pace(speed)), acted(Pace(speed, jaw_speed=0.25))
         np.testing.assert_array_equal(slow[:, :6], whole[:, :6])
         np.testing.assert_array_equal(slow[:, 6], np.float32(0.25) * whole[:, 6])
+        assert np.abs(slow[:, 6]).min() > 0
+        late = acted(Pace(speed, clock_speed=0.5))
+        np.testing.assert_array_equal(late[::2], whole[:20])
 
 
 def test_a_clock_goes_with_proprioception() -> None:

@@ -20,7 +20,7 @@ from policies.bc import BC
 from policies.chunks import ChunkPolicy, ChunkRecipe
 from policies.lerobot import DIFFUSION, VQBET
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import FULL_SPEED, Pace, TaskConfig
 from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.lazy import LazyMapping
@@ -238,7 +238,7 @@ def test_how_chunks_are_acted_is_changed_without_a_training(
     )
     for change, error, said in (
         ({"execute": 9}, InputError, "1 to chunk, 4"),
-        ({"chunk": 2}, UnknownName, "ensemble, execute, samples"),
+        ({"chunk": 2}, UnknownName, "clock_speed, ensemble, execute, jaw_speed, samples, speed"),
         ({"excute": 1}, UnknownName, "Did you mean 'execute'"),
     ):
         with pytest.raises(error, match=said):
@@ -357,7 +357,7 @@ def test_the_average_is_the_weighted_sum_of_all_weights() -> None:
 
 
 def acting(
-    recipe: ChunkRecipe, action_repeat: int = 1, speed: float = 1.0
+    recipe: ChunkRecipe, action_repeat: int = 1, pace: Pace = FULL_SPEED
 ) -> tuple[ChunkAgent, list[float]]:
     """Return an agent of a policy without images, and the seeds it plans with."""
     policy = Linear(recipe, ())
@@ -370,7 +370,7 @@ def acting(
         return (start[-1] * 100 + start[0] * 10 + steps * np.ones((1, 1, 7))).astype(np.float32)
 
     policy.plan = plan  # type: ignore[method-assign,assignment]
-    senses = PolicyAgent("linear", policy, None, (), 32, action_repeat=action_repeat, speed=speed)
+    senses = PolicyAgent("linear", policy, None, (), 32, action_repeat=action_repeat, pace=pace)
     return ChunkAgent(policy, senses), seeds
 
 
@@ -415,7 +415,7 @@ def test_a_chunk_is_executed_at_the_policy_s_speed() -> None:
     agent, _ = acting(replace(QUICK, execute=3, frame_stride=2))
     agent.reset(0, None, 7)
     whole = moved(agent, 7)
-    agent, _ = acting(replace(QUICK, execute=3, frame_stride=2), speed=0.5)
+    agent, _ = acting(replace(QUICK, execute=3, frame_stride=2), pace=Pace(speed=0.5))
     agent.reset(0, None, 7)
     assert moved(agent, 7) == [action / 2 for action in whole]
 
