@@ -27,7 +27,15 @@ from surgicai_vision.envs.pullout import Pullout
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.envs.suture import Suture
 
-__all__ = ["SUBTASKS", "GoalSuturingEnv", "SuturingEnv", "make", "make_registered", "make_task"]
+__all__ = [
+    "SUBTASKS",
+    "GoalSuturingEnv",
+    "SuturingEnv",
+    "check_world",
+    "make",
+    "make_registered",
+    "make_task",
+]
 
 OPTIONS = (
     *("step", "tolerance", "reward", "max_steps", "advance"),
@@ -64,6 +72,23 @@ def make(
         return procedure(config, tuple(SUBTASKS.values()), view, render_mode, truncates)
     single = GoalSuturingEnv if shows_goal else SuturingEnv
     return single(config, (_subtask(config.task),), view, render_mode, truncates)
+
+
+@functools.lru_cache(maxsize=256)
+def check_world(env: TaskConfig, where: str) -> None:
+    """Refuse a world that geometry forbids (`envs.feasibility`), before any work.
+
+    Args:
+        env: the task in its world.
+        where: what is done in it, the beginning of the message.
+
+    Raises:
+        InputError: naming the obstacle and what is allowed instead.
+    """
+    try:
+        make(env).close()
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def _sides(image_size: object) -> tuple[int, int]:

@@ -1,14 +1,11 @@
 """Prepare: a task's demonstrations and its dataset in one folder, each made where it is missing."""
 
-import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset.layouts import SURGICAI
@@ -35,23 +32,6 @@ def check_dataset(dataset: DatasetConfig) -> None:
         check_request(recorded.view, dataset.size, recorded.frame_stride, None, SURGICAI)
     if recorded.upset_fraction:
         check_upset_task(recorded.task)
-
-
-@functools.lru_cache(maxsize=256)
-def check_world(env: TaskConfig, where: str) -> None:
-    """Refuse a world that geometry forbids (`envs.feasibility`), before any work.
-
-    Args:
-        env: the task in its world.
-        where: what is done in it, the beginning of the message.
-
-    Raises:
-        InputError: naming the obstacle and what is allowed instead.
-    """
-    try:
-        envs.make(env).close()
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
 
 
 def make_dataset(

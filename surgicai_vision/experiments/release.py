@@ -25,6 +25,7 @@ from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.subset import of_subtask
+from surgicai_vision.envs import check_world
 from surgicai_vision.evaluation.hierarchical_config import hierarchical_yaml
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.provenance import command_line
@@ -36,7 +37,6 @@ from surgicai_vision.experiments.plan_config import Plan, plan_of
 from surgicai_vision.experiments.plan_parts import PlannedPolicy
 from surgicai_vision.experiments.prepare import (
     check_dataset,
-    check_world,
     demos_folders,
     make_dataset,
 )

@@ -376,6 +376,19 @@ def test_wrong_axes_and_strengths_are_refused(tmp_path):
             curves.robustness(seeing_spec(), SEEDS, tmp_path, silent, ("blur",), strengths)
 
 
+def test_a_world_that_is_impossible_at_the_largest_strength_is_refused_before_any_episode(
+    tmp_path, pretend
+):
+    anywhere = RandomisationConfig(pair="any", phantom_shift=10.0)
+    spec = seeing_spec(TaskConfig("handoff", randomisation=anywhere))
+    axes = ("light", "needle")
+    with pytest.raises(InputError, match=r"needle at strength 1: .* makes 'handoff' impossible"):
+        curves.robustness(spec, SEEDS, tmp_path / "a", silent, axes, (0.0, 0.5, 1.0))
+    assert pretend.calls == [] and not (tmp_path / "a").exists()
+    curves.robustness(spec, SEEDS, tmp_path / "a", silent, axes, (0.0, 0.5))
+    assert ("needle", 0.5) in pretend.calls
+
+
 def test_the_verb_measures_the_expert_and_continues(tmp_path, capsys):
     make = [
         "robustness",

@@ -16,6 +16,7 @@ from surgicai_vision.core import files
 from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.progress import Stage
+from surgicai_vision.envs import check_world
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.robustness import CURVES, MARK, STRENGTHS
 from surgicai_vision.evaluation.robustness.axes import AXES, axes_of, shifted
@@ -69,12 +70,17 @@ def robustness(
 
     Raises:
         UnknownName: an axis that does not exist.
-        InputError: strengths out of range or order, seeds that `check_seeds` refuses, or an axis
-            of images for a policy that sees none.
+        InputError: strengths out of range or order, seeds that `check_seeds` refuses, an axis of
+            images for a policy that sees none, or one that makes its world impossible at the
+            largest strength.
         OutputExists: `out` holds the curves of another policy, of other starts or of another scene.
     """
     chosen = _checked(spec, axes, strengths)
     check_seeds(seeds)
+    for axis in chosen:
+        if not (out / axis / f"{strengths[-1]:g}" / MARKER).exists():
+            farthest = shifted(spec, axis, strengths[-1]).config
+            check_world(farthest, f"axis {axis} at strength {strengths[-1]:g}")
     _claim(out, spec, seeds)
     check_scene(out, spec.config.scene, "curves")
     places = [out / axis / f"{0.0:g}" for axis in AXES]

@@ -17,11 +17,12 @@ from surgicai_vision.core.files import read_json
 from surgicai_vision.core.plugins import DISTRIBUTION
 from surgicai_vision.core.tasks import TASKS
 from surgicai_vision.demos.store import demos_digest, list_demos
+from surgicai_vision.envs import check_world
 from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.evaluation.robustness.axes import AXES, shifted_config
 from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_versioned
 from surgicai_vision.experiments.plan_config import plan_of
-from surgicai_vision.experiments.prepare import check_dataset, check_world, demos_folders
+from surgicai_vision.experiments.prepare import check_dataset, demos_folders
 from surgicai_vision.experiments.sweep.experiment import Experiment, Training
 from surgicai_vision.experiments.sweep.grid import Grid
 from surgicai_vision.experiments.sweep.lerobot import OPTIONS
