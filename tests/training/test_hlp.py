@@ -67,6 +67,8 @@ def test_a_speed_is_refused() -> None:
         HLPRecipe(speed=0.5)
     with pytest.raises(InputError, match="leave 'jaw_speed' at 1"):
         HLPRecipe(jaw_speed=0.5)
+    with pytest.raises(InputError, match="leave 'clock_speed' at 1"):
+        HLPRecipe(clock_speed=0.5)
 
 
 def test_without_progress_it_is_the_policy_it_was(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def robustness(
     chosen = _checked(spec, axes, strengths)
     check_seeds(seeds)
     for axis in chosen:
-        if not (out / axis / f"{strengths[-1]:g}" / MARKER).exists():
+        if AXES[axis].world and not (out / axis / f"{strengths[-1]:g}" / MARKER).exists():
             farthest = shifted(spec, axis, strengths[-1]).config
             check_world(farthest, f"axis {axis} at strength {strengths[-1]:g}")
     _claim(out, spec, seeds)
