@@ -137,6 +137,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     if options.upset:
         check_upset_task(spec.config.task)
         spec = replace(spec, run=replace(spec.run, upset=True))
+    note_aim(spec, console)
     seeds = range(options.seed, options.seed + options.episodes)
     out = options.out or folders.evaluation_folder(spec, options.seed, options.episodes)
     folders.check_folder(out, MARKER, ours=OURS)
@@ -161,6 +162,17 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 def varied(config: TaskConfig) -> dict[str, object]:
     """Return the axes along which the world varies from episode to episode, with their values."""
     return {axis: vars(config.randomisation)[axis] for axis in config.randomisation.on}
+
+
+def note_aim(spec: "PolicySpec", console: Console) -> None:
+    """Say so if a policy learned from crops that a detector aims and acts on others."""
+    looks = spec.run.variants
+    if looks and looks.aimed and not spec.run.detector:
+        console.note(
+            "note: this policy learned from crops where a detector sees the jaws (render-demos "
+            "--aimed); without --detector they lie where the arm reports them, which is "
+            "elsewhere where cameras or joints are off."
+        )
 
 
 def say_conditions(seeds: range, config: TaskConfig, console: Console) -> None:

@@ -233,14 +233,23 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     rendered = folders.open_dataset(options.dataset, shown, run.views)
     task = rendered.config.task
     folders.check_task(options.task, task, rendered.path)
+    made = rendered.made
+    run = replace(
+        run,
+        demonstrator=made.demonstrator,
+        noise=made.noise,
+        post_success_steps=made.post_success_steps,
+        frame_stride=made.frame_stride,
+        variants=made.variants,
+    )
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = options.out or folders.train_folder(label, run.name, run.seed)
     folders.check_folder(out, REQUEST, ours=(LOCK,))
     is_high_level = policies.policy_plugin(run.policy).target == names.STAGE
-    if rendered.late and not is_high_level:
+    if made.late and not is_high_level:
         console.note(
             f"warning: demonstrations of {rendered.path} notice a lost needle up to "
-            f"{rendered.late} control steps late (record-demos --late) and until then act as if "
+            f"{made.late} control steps late (record-demos --late) and until then act as if "
             f"they still held it; '{run.policy}' learns that too. `cut-demos` takes a subtask's "
             "visits without it."
         )

@@ -41,6 +41,7 @@ from surgicai_vision.core.errors import (
 from surgicai_vision.core.files import read_json, sha256_file
 from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset import codecs, schema
+from surgicai_vision.dataset.made import Made
 from surgicai_vision.dataset.protocol import episode_bounds
 from surgicai_vision.dataset.video import read_frames
 
@@ -86,8 +87,7 @@ class RenderedDataset:
             steps from frame to frame.
         variants: number of consecutive episodes that show one demonstration in different looks.
         video: codec of the RGB views, None if they are lossless images.
-        late: the most control steps by which its demonstrators noticed a loss late
-            (`demos.disturbance.Disturbance`).
+        made: how its demonstrations were made and rendered.
     """
 
     def __init__(self, path: Path):
@@ -103,8 +103,7 @@ class RenderedDataset:
             self.fps = int(self.meta["fps"])
             self.variants = int(self.meta.get("variants", 1))
             self.video: str | None = self.meta.get("video")
-            requests = [asked or {} for asked in self.meta.get("demos_requests", ())]
-            self.late = max((int(asked.get("late", 0)) for asked in requests), default=0)
+            self.made = Made.of(self.meta)
             self.has_depth = bool(self.meta["depth"])
             self.has_segmentation = bool(self.meta["segmentation"])
             checked(self.meta["digest"], str, f"{file}: digest")

@@ -93,8 +93,8 @@ class RunConfig:
         noise: strength of the disturbance of the demonstrator's executed actions.
         post_success_steps: control steps that demonstrations continue after their success.
         frame_stride: control steps between frames of the dataset.
-        variants: the looks in which each demonstration was rendered, if a plan sets them; None if
-            as recorded, or unknown.
+        variants: the looks in which each demonstration was rendered; None if as recorded, or
+            unknown.
         multiplied_from: number of demonstrations from which those trained on were re-posed
             (`demos.multiply`), if a plan sets it; None if they were not.
         dagger_rounds: DAgger rounds included in the demonstrations, if a plan sets them.

@@ -13,7 +13,9 @@ from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import OutputExists
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.files import CACHE_VARIABLE, write_json
+from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset import render_demos
+from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.demos.record import record
 from surgicai_vision.features.cache import list_cache
 from surgicai_vision.training.checkpoint import read_checkpoint
@@ -118,6 +120,40 @@ def test_a_checkpoint_is_named_by_the_task_of_its_data(tmp_path, capsys):
     given = ["train", "--algo", "bc", "--demos", "demos", "--task", "grasp"]
     assert main(given) == 2
     assert "--task grasp: demos shows place" in capsys.readouterr().err
+
+
+def test_a_checkpoint_says_how_its_demonstrations_were_made(tmp_path, capsys):
+    record(
+        TaskConfig("place"),
+        episodes=1,
+        out=tmp_path / "demos",
+        disturbance=Disturbance(noise=0.5),
+        post_success_steps=3,
+        context=RunContext(0),
+    )
+    looks = Variants("train", shift=0.5, aimed=True)
+    render_demos(
+        tmp_path / "demos",
+        tmp_path / "dataset",
+        views=("front_psm2",),
+        size=32,
+        frame_stride=5,
+        variants=looks,
+        context=RunContext(0),
+    )
+    given = ["train", "--encoder", "random-conv", "--view", "front_psm2", "--epochs", "1"]
+    assert main([*given, "--dataset", "dataset", "--change", "frame_stride=5"]) == 0
+    (out,) = (file.parent for file in tmp_path.glob("outputs/train/*/checkpoint.json"))
+    assert looks.name in out.name
+    run = read_checkpoint(out).run
+    assert (run.demonstrator, run.noise, run.post_success_steps) == ("expert", 0.5, 3)
+    assert (run.frame_stride, run.variants) == (5, looks)
+    (tmp_path / "short.yaml").write_text("env: {max_steps: 2}")
+    given = ["evaluate", str(out), "--episodes", "1", "--workers", "1", "--config", "short.yaml"]
+    capsys.readouterr()
+    for aiming, is_noted in (([], True), (["--detector", "released:detector"], False)):
+        assert main([*given, *aiming]) == 0
+        assert ("without --detector" in capsys.readouterr().err) == is_noted
 
 
 @pytest.fixture

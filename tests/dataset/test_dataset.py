@@ -477,13 +477,13 @@ def test_images_are_lossless(shape):
 
 def test_a_dataset_knows_how_late_its_demonstrators_noticed_a_loss(tmp_path, fake, demos):
     render(demos, tmp_path / "set")
-    assert open_dataset(tmp_path / "set").late == 0
+    assert open_dataset(tmp_path / "set").made.late == 0
     meta = tmp_path / "set" / names.META_FILE
     content = json.loads(meta.read_text())
     assert content["demos_requests"] == [read_marker(demos).get("request")]
     for requests, late in (([{"late": 40}, None, {"late": 5}], 40), ([], 0)):
         meta.write_text(json.dumps({**content, "demos_requests": requests}))
-        assert open_dataset(tmp_path / "set").late == late
+        assert open_dataset(tmp_path / "set").made.late == late
     meta.write_text(json.dumps({**content, "demos_requests": ["late"]}))
     with pytest.raises(BadFile, match="is damaged"):
         open_dataset(tmp_path / "set")

@@ -17,6 +17,7 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
+from surgicai_vision.dataset.made import Made
 from surgicai_vision.dataset.subset import first_of_visit, of_subtask, with_frame_stride
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies, visits
@@ -33,7 +34,7 @@ class Dataset(FakeData):
     length: int = 40
     fingerprint: str = "noise"
     path: Path = Path("noise")
-    late: int = 0
+    made: Made = field(default_factory=Made)
     config: TaskConfig = field(default_factory=lambda: TaskConfig("suture"))
 
     def __post_init__(self) -> None:
@@ -203,7 +204,8 @@ def test_a_low_level_policy_is_warned_of_what_teaches_a_high_level_one(
 ) -> None:
     arguments = ("train", "--task", "suture", "--encoder", "none", "--epochs", "1")
     for late, policy, is_warned in ((0, "bc", False), (40, "bc", True), (40, "hlp", False)):
-        monkeypatch.setattr(folders, "open_dataset", lambda *_, late=late: Dataset(late=late))
+        dataset = Dataset(made=Made(late=late))
+        monkeypatch.setattr(folders, "open_dataset", lambda *_, dataset=dataset: dataset)
         assert main([*arguments, "--policy", policy, "--out", f"{policy}{late}"]) == 0
         said = capsys.readouterr().err
         assert ("up to 40 control steps late" in said) == is_warned
