@@ -43,6 +43,7 @@ from surgicai_vision.training.run_config import RunConfig, with_budget
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset import Dataset
+    from surgicai_vision.dataset.made import Made
     from surgicai_vision.rl.settings import Request
 
 app = App(
@@ -233,23 +234,16 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     rendered = folders.open_dataset(options.dataset, shown, run.views)
     task = rendered.config.task
     folders.check_task(options.task, task, rendered.path)
-    made = rendered.made
-    run = replace(
-        run,
-        demonstrator=made.demonstrator,
-        noise=made.noise,
-        post_success_steps=made.post_success_steps,
-        frame_stride=made.frame_stride,
-        variants=made.variants,
-    )
+    run = _learning_from(run, rendered.made)
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = options.out or folders.train_folder(label, run.name, run.seed)
     folders.check_folder(out, REQUEST, ours=(LOCK,))
     is_high_level = policies.policy_plugin(run.policy).target == names.STAGE
-    if made.late and not is_high_level:
+    late = rendered.made.late
+    if late and not is_high_level:
         console.note(
             f"warning: demonstrations of {rendered.path} notice a lost needle up to "
-            f"{made.late} control steps late (record-demos --late) and until then act as if "
+            f"{late} control steps late (record-demos --late) and until then act as if "
             f"they still held it; '{run.policy}' learns that too. `cut-demos` takes a subtask's "
             "visits without it."
         )
@@ -284,6 +278,18 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     if not is_high_level:
         console.say(f"next: surgicai-vision evaluate {out}")
     return {"checkpoint": str(out)}
+
+
+def _learning_from(run: RunConfig, made: "Made") -> RunConfig:
+    """Return a run that records how its dataset's demonstrations were made."""
+    return replace(
+        run,
+        demonstrator=made.demonstrator,
+        noise=made.noise,
+        post_success_steps=made.post_success_steps,
+        frame_stride=made.frame_stride,
+        variants=made.variants,
+    )
 
 
 def _tell_errors(checkpoint: Checkpoint, console: Console) -> None:
