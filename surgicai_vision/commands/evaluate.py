@@ -125,6 +125,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         _filming(options)  # refuses options that go with --video
         return _evaluate_swaps(options, console)
     spec = open_given(
+        console,
         options.policy,
         options.task,
         options.env,
@@ -137,7 +138,6 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     if options.upset:
         check_upset_task(spec.config.task)
         spec = replace(spec, run=replace(spec.run, upset=True))
-    note_aim(spec, console)
     seeds = range(options.seed, options.seed + options.episodes)
     out = options.out or folders.evaluation_folder(spec, options.seed, options.episodes)
     folders.check_folder(out, MARKER, ours=OURS)
@@ -164,13 +164,13 @@ def varied(config: TaskConfig) -> dict[str, object]:
     return {axis: vars(config.randomisation)[axis] for axis in config.randomisation.on}
 
 
-def note_aim(spec: "PolicySpec", console: Console) -> None:
+def _note_aim(spec: "PolicySpec", console: Console) -> None:
     """Say so if a policy learned from crops that a detector aims and acts on others."""
     looks = spec.run.variants
     if looks and looks.aimed and not spec.run.detector:
         console.note(
             "note: this policy learned from crops where a detector sees the jaws (render-demos "
-            "--aimed); without --detector they lie where the arm reports them, which is "
+            "--aimed); without a detector they lie where the arm reports them, which is "
             "elsewhere where cameras or joints are off."
         )
 
@@ -206,6 +206,7 @@ def _filming(options: Options) -> "Filming | None":
 
 
 def open_given(
+    console: Console,
     policy: str,
     task: str | None,
     env: dict[str, object] | None,
@@ -215,7 +216,10 @@ def open_given(
     changes: tuple[str, ...] = (),
     detector: str | None = None,
 ) -> "PolicySpec":
-    """Return the policy that the options of this or another command describe."""
+    """Return the policy that the options of this or another command describe.
+
+    Says so if the policy learned from crops that a detector aims and is given none.
+    """
     from surgicai_vision.evaluation.policy_spec import open_policy
 
     _check_dataset(policy, dataset)
@@ -230,6 +234,7 @@ def open_given(
         changes=changes,
     )
     if detector is None:
+        _note_aim(spec, console)
         return spec
     from surgicai_vision.evaluation.aimed_agent import aimed
 

@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.evaluate import note_aim, open_given, say_conditions
+from surgicai_vision.commands.evaluate import open_given, say_conditions
 from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
@@ -87,6 +87,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     from surgicai_vision.evaluation.robustness.curves import robustness
 
     spec = open_given(
+        console,
         options.policy,
         options.task,
         options.env,
@@ -95,7 +96,6 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         changes=options.change,
         detector=options.detector,
     )
-    note_aim(spec, console)
     out = options.out or folders.robustness_folder(spec, options.seed, options.episodes)
     folders.check_folder(out, MARK)
     seeds = range(options.seed, options.seed + options.episodes)

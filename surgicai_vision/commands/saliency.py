@@ -66,6 +66,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
     folders.check_file(options.out, "--out", SUFFIXES)
     spec = open_given(
+        console,
         options.policy,
         options.task,
         options.env,

@@ -96,6 +96,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
             "same time. Leave some out; its buttons change them."
         )
     spec = open_given(
+        console,
         options.policy,
         options.task,
         options.env,

@@ -10,11 +10,15 @@ from checkpoints import checkpoint
 from matplotlib.figure import Figure
 
 from surgicai_vision.commands import folders
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import files
-from surgicai_vision.evaluation import occlusion, run, storage
+from surgicai_vision.core.variants import Variants
+from surgicai_vision.evaluation import occlusion, policy_spec, run, storage
 from surgicai_vision.evaluation.agents import ZeroAgent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
+from surgicai_vision.features.encoders import WeightsSource
 from surgicai_vision.training.run_config import RunConfig
 
 SHORT = "env: {max_steps: 2}\n"
@@ -46,6 +50,16 @@ def test_evaluations_of_two_envs_are_kept_side_by_side(tmp_path, monkeypatch, ca
         assert main(["evaluate", "zero", *arguments]) == 0
         made.add(json.loads(capsys.readouterr().out.splitlines()[-1])["out"])
     assert len(made) == 2 and len(storage.find_evaluations(tmp_path)) == 2
+
+
+@pytest.mark.parametrize("aimed", [True, False])
+def test_a_policy_of_aimed_crops_is_told_that_it_has_no_detector(aimed, monkeypatch, capsys):
+    plain = open_policy("zero", env={"max_steps": 2})
+    looks = Variants(corruption=0.5, aimed=aimed)
+    spec = replace(plain, run=replace(plain.run, variants=looks))
+    monkeypatch.setattr(policy_spec, "open_policy", lambda *_, **__: spec)
+    assert open_given(Console(), "zero", None, None, None, WeightsSource()) is spec
+    assert ("without a detector" in capsys.readouterr().err) == aimed
 
 
 def test_a_second_evaluation_into_a_folder_is_refused_before_its_rollouts(

@@ -132,6 +132,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     frames = from_mapping(Frames, options.frames or {}, "frames")
     switch = _switch(options)
     spec = open_given(
+        console,
         options.policy,
         options.task,
         options.env,
