@@ -52,14 +52,14 @@ def test_every_run_counts_on_the_same_held_out_starts_and_learns_from_held_in_lo
         assert dataset.first_seed + 4 * dataset.demonstrations.episodes < names.VALIDATION_SEED
 
 
-def test_corrupted_images_are_of_the_demonstrations_that_clear_ones_are_of():
+def test_shifted_images_are_of_the_demonstrations_that_clear_ones_are_of():
     for seed in UNMOVED.seed:
-        clear, corrupted = (
-            UNMOVED.datasets[f"seed{seed}/{name}"] for name in ("place", "place-corrupted")
+        clear, shifted = (
+            UNMOVED.datasets[f"seed{seed}/{name}"] for name in ("handoff", "handoff-robust")
         )
-        assert corrupted.first_seed == clear.first_seed
-        other = {"name": "place-corrupted", "corruption": 0.5}
-        assert corrupted.demonstrations == replace(clear.demonstrations, **other)
+        assert shifted.first_seed == clear.first_seed
+        other = {"name": "handoff-robust", "corruption": 0.5, "shift": 0.5, "aimed": True}
+        assert shifted.demonstrations == replace(clear.demonstrations, **other)
 
 
 def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
