@@ -52,14 +52,18 @@ def test_every_run_counts_on_the_same_held_out_starts_and_learns_from_held_in_lo
         assert dataset.first_seed + 4 * dataset.demonstrations.episodes < names.VALIDATION_SEED
 
 
-def test_shifted_images_are_of_the_demonstrations_that_clear_ones_are_of():
+@pytest.mark.parametrize(
+    ("plain", "changed", "how"),
+    [
+        ("place", "place-corrupted", {"corruption": 0.5}),
+        ("handoff", "handoff-robust", {"corruption": 0.5, "shift": 0.5, "aimed": True}),
+    ],
+)
+def test_changed_images_are_of_the_demonstrations_that_clear_ones_are_of(plain, changed, how):
     for seed in UNMOVED.seed:
-        clear, shifted = (
-            UNMOVED.datasets[f"seed{seed}/{name}"] for name in ("handoff", "handoff-robust")
-        )
-        assert shifted.first_seed == clear.first_seed
-        other = {"name": "handoff-robust", "corruption": 0.5, "shift": 0.5, "aimed": True}
-        assert shifted.demonstrations == replace(clear.demonstrations, **other)
+        clear, other = (UNMOVED.datasets[f"seed{seed}/{name}"] for name in (plain, changed))
+        assert other.first_seed == clear.first_seed
+        assert other.demonstrations == replace(clear.demonstrations, name=changed, **how)
 
 
 def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
@@ -70,8 +74,8 @@ def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
         "all axes at half strength with aimed crops",
         "needles never seen",
     )
-    # Two policies per subtask, in two training seeds.
-    assert by_condition(UNMOVED) == dict.fromkeys(conditions, 2 * 10)
+    # Two policies per subtask, three of the placement, in two training seeds.
+    assert by_condition(UNMOVED) == dict.fromkeys(conditions, 2 * 11)
     assert {run.task for run in UNMOVED.runs} == set(names.SUBTASKS)
     assert UNMOVED.seed == (0, 1)
     looks = {shows(dataset).appearance for dataset in UNMOVED.datasets.values()}
