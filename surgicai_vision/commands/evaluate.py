@@ -165,9 +165,9 @@ def varied(config: TaskConfig) -> dict[str, object]:
 
 
 def _note_aim(spec: "PolicySpec", console: Console) -> None:
-    """Say so if a policy learned from crops that a detector aims and acts on others."""
+    """Say so if a policy without a detector learned from crops that one aims."""
     looks = spec.run.variants
-    if looks and looks.aimed and not spec.run.detector:
+    if looks and looks.aimed:
         console.note(
             "note: this policy learned from crops where a detector sees the jaws (render-demos "
             "--aimed); without a detector they lie where the arm reports them, which is "
