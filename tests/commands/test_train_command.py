@@ -153,7 +153,7 @@ def test_a_checkpoint_says_how_its_demonstrations_were_made(tmp_path, capsys):
     capsys.readouterr()
     for aiming, is_noted in (([], True), (["--detector", "released:detector"], False)):
         assert main([*given, *aiming]) == 0
-        assert ("without --detector" in capsys.readouterr().err) == is_noted
+        assert ("without a detector" in capsys.readouterr().err) == is_noted
 
 
 @pytest.fixture
