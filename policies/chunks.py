@@ -14,8 +14,8 @@ Interface:
   training frames in the way of LeRobot's normalisers: "mean_std" or "min_max" (to [-1, 1]).
 
 `surgicai_vision.training.chunks` builds the column of chunks;
-`surgicai_vision.evaluation.chunk_agent` executes chunks. Members: LeRobot's `act`, `diffusion` and
-`vqbet`, from the distribution `lerobot_env_surgicai`.
+`surgicai_vision.evaluation.chunk_agent` executes chunks. Members: `bc-chunk`, and LeRobot's `act`,
+`diffusion` and `vqbet`, from the distribution `lerobot_env_surgicai`.
 """
 
 import abc
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from policies.base import ACTIONS, Inputs, Policy, Recipe, fed_vector
 from policies.layers import FeatureHeads
-from surgicai_vision.core.config import JSON
+from surgicai_vision.core.config import JSON, LATER
 from surgicai_vision.core.errors import InputError, check_at_least, check_at_most, check_name, shown
 
 NORMALISATIONS = ("mean_std", "min_max")
@@ -52,6 +52,8 @@ class ChunkRecipe(Recipe):
         samples: chunks that a sampling policy draws per plan; their mean is executed.
         ensemble: average overlapping chunks with the weights exp(-ensemble · i), i = 0 for the
             oldest; None executes only the newest.
+        measure_delay: measure how late actions take effect, and execute of each plan the action
+            that is due by then (`evaluation.delay`); needs a chunk longer than the delay.
         ema: largest decay of the moving average of the weights; 0 keeps the last weights.
         clip_gradient: gradient norm limit; 0 disables clipping.
         minutes: train for as many epochs as fit into this many minutes of one core, instead of
@@ -69,6 +71,7 @@ class ChunkRecipe(Recipe):
     clip_gradient: float = 0.0
     minutes: float = 0.0
     settings: dict[str, JSON] = field(default_factory=dict)
+    measure_delay: bool = field(default=False, metadata=LATER)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,7 +110,7 @@ class ChunkPolicy(Policy, abc.ABC):
         normalisation: how actions are normalised, one of `NORMALISATIONS`.
 
     Attributes:
-        chunk, execute, samples, ensemble: as in the recipe.
+        chunk, execute, samples, ensemble, measure_delay: as in the recipe.
         spacing: control steps from one observation of the history to the next.
         heads: the heads for the features.
     """
@@ -127,6 +130,7 @@ class ChunkPolicy(Policy, abc.ABC):
         self.execute = recipe.execute
         self.samples = recipe.samples
         self.ensemble = recipe.ensemble
+        self.measure_delay = recipe.measure_delay
         self.spacing = recipe.frame_stride
         self.heads = FeatureHeads(recipe, self.inputs)
         self._normalisation = normalisation

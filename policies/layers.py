@@ -251,9 +251,19 @@ class FeatureHeads(_Heads):
         return torch.cat(seen, dim=1) if seen else vector[:, :0], vector
 
 
+def mlp(recipe: Recipe, width: int, answers: int) -> nn.Sequential:
+    """Return the paper's layers, each preceded by BatchNorm: (B, width) → (B, answers)."""
+    layers: list[nn.Module] = []
+    for hidden in recipe.hidden:
+        layers += [nn.BatchNorm1d(width)] if recipe.batch_norm else []
+        layers += [nn.Linear(width, hidden), nn.ReLU()]
+        width = hidden
+    return nn.Sequential(*layers, nn.Linear(width, answers))
+
+
 @final
 class FeatureMLP(_Heads):
-    """The paper's network on features and a vector: layers, each preceded by BatchNorm.
+    """The paper's network on features and a vector.
 
     Attributes:
         width: length of the heads' output concatenated with the vector.
@@ -261,13 +271,8 @@ class FeatureMLP(_Heads):
 
     def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
         super().__init__(recipe, inputs)
-        layers: list[nn.Module] = []
-        self.width = width = self.dim + inputs.width
-        for hidden in recipe.hidden:
-            layers += [nn.BatchNorm1d(width)] if recipe.batch_norm else []
-            layers += [nn.Linear(width, hidden), nn.ReLU()]
-            width = hidden
-        self.layers = nn.Sequential(*layers, nn.Linear(width, answers))
+        self.width = self.dim + inputs.width
+        self.layers = mlp(recipe, self.width, answers)
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
         """Return (B, answers) for normalised inputs (B, inputs.dim)."""

@@ -2,13 +2,17 @@
 
 Interface:
 
-* `ChunkAgent(policy, senses)`: an agent; `senses` is the same policy's `PolicyAgent`, which reads
-  vectors and features and never acts.
+* `ChunkAgent(policy, senses, step)`: an agent; `senses` is the same policy's `PolicyAgent`, which
+  reads vectors and features and never acts.
 
 Each slot plans by itself, in a batch of one, with random numbers drawn from its own seed and step.
 A result therefore depends neither on the batch nor on the processes. An image is read and encoded
 when its observation arrives, and only if this plan or a later one needs it: an env that renders
 images on access cannot show one later. `restart` forgets what is planned.
+
+With `ChunkRecipe.measure_delay` it measures how late its actions take effect (`evaluation.delay`).
+Where the delay is d, the observation of step t shows what t - d actions have done. The policy is
+then told the time t - d, and of its plan, which begins there, the action d steps ahead is executed.
 """
 
 from collections import deque
@@ -22,6 +26,7 @@ from numpy.typing import NDArray
 from policies.chunks import ChunkPolicy
 from surgicai_vision.evaluation.agent import Actions, Agent, FeatureTable, Observation, Robot
 from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.evaluation.delay import DelayMeter
 from surgicai_vision.training.threads import one_thread
 
 SEED_STRIDE = 1_000_003
@@ -48,13 +53,17 @@ class _Episode:
     Attributes:
         seed: the episode's.
         tick: actions since its subtask began.
+        meter: measures the delay; None if it is not asked for.
+        late: by how many actions the observation of this step is behind the actions sent.
         past: the last moments, the present one last.
-        plans: (tick at which it was made, its actions (chunk, 7)), the oldest first.
+        plans: (tick at which its first action is due, its actions (chunk, 7)), the oldest first.
     """
 
     seed: int
     past: deque[_Moment]
     tick: int = 0
+    meter: DelayMeter | None = None
+    late: int = 0
     plans: list[tuple[int, NDArray[np.float32]]] = field(default_factory=list)
 
 
@@ -65,9 +74,10 @@ class ChunkAgent(Agent):
     Args:
         policy: makes the plans.
         senses: reads the same policy's features and vectors.
+        step: way that an action of 1 commands in a control step [m]; a delay is measured by it.
     """
 
-    def __init__(self, policy: ChunkPolicy, senses: PolicyAgent):
+    def __init__(self, policy: ChunkPolicy, senses: PolicyAgent, step: float):
         self.name = senses.name
         self.cameras = senses.cameras
         self.image_size = senses.image_size
@@ -76,6 +86,7 @@ class ChunkAgent(Agent):
         self._policy = policy
         self._senses = senses
         self._sees = bool(senses.views)
+        self._step = step * senses.action_repeat
         # Actions, not control steps, from one observation of the history to the next.
         self._spacing = policy.spacing // senses.action_repeat
         self._episodes: dict[int, _Episode] = {}
@@ -87,7 +98,7 @@ class ChunkAgent(Agent):
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Forget everything; random numbers are drawn from `seed`."""
         moments = (self._policy.history - 1) * self._spacing + 1
-        self._episodes[slot] = _Episode(seed, deque(maxlen=moments))
+        self._episodes[slot] = _Episode(seed, deque(maxlen=moments), meter=self._meter())
 
     def restart(self, slot: int) -> None:
         """Forget what the slot has planned and seen: its subtask begins."""
@@ -95,23 +106,37 @@ class ChunkAgent(Agent):
         episode.past.clear()
         episode.plans.clear()
         episode.tick = 0
+        episode.meter = self._meter()
+        episode.late = 0
 
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the planned actions of this step (n, 7), at the policy's pace."""
         episodes = [self._episodes[slot] for slot in slots]
+        for episode, robot in zip(episodes, robots, strict=True):
+            if episode.meter is not None:
+                episode.meter.see(robot.agent_pos())
+                episode.late = min(episode.meter.delay, episode.tick)
         with one_thread():
-            ticks = [episode.tick for episode in episodes]
+            ticks = [episode.tick - episode.late for episode in episodes]
             vectors = self._senses.vectors(robots, observations, ticks)
             features = self._features(episodes, observations)
             for episode, seen, vector in zip(episodes, features, vectors, strict=True):
                 episode.past.append(_Moment(seen, vector))
             self._plan([episode for episode in episodes if self._is_due(episode.tick)])
-        actions = [self._action(episode) for episode in episodes]
-        for episode in episodes:
+        actions = np.stack([self._action(episode) for episode in episodes])
+        executed = actions * self._senses.pace.executed
+        for episode, action in zip(episodes, executed, strict=True):
             episode.tick += 1
-        return np.stack(actions) * self._senses.pace.executed
+            if episode.meter is not None:
+                episode.meter.send(action)
+        return executed
+
+    def _meter(self) -> DelayMeter | None:
+        """Return a new meter, for delays that a chunk spans; None if none is asked for."""
+        longest = self._policy.chunk - 1
+        return DelayMeter(self._step, longest) if self._policy.measure_delay else None
 
     def _is_due(self, tick: int) -> bool:
         """Return True if a plan is made at `tick`: every `execute` actions, from 0 on."""
@@ -150,8 +175,8 @@ class ChunkAgent(Agent):
                 np.stack([moment.vector for moment in history])[None],
                 episode.seed * SEED_STRIDE + episode.tick,
             )[0]
-            kept = [(tick, plan) for tick, plan in episode.plans if episode.tick - tick < len(plan)]
-            episode.plans = [*kept, (episode.tick, chunk)]
+            kept = [(at, plan) for at, plan in episode.plans if episode.tick - at < len(plan)]
+            episode.plans = [*kept, (episode.tick - episode.late, chunk)]
 
     def _history(self, episode: _Episode) -> list[_Moment]:
         """Return the moments that the policy sees, the present one last.
@@ -166,12 +191,15 @@ class ChunkAgent(Agent):
         return [past[max(0, at)] for at in back]
 
     def _action(self, episode: _Episode) -> NDArray[np.float32]:
-        """Return the action of this step (7,), from the newest plan or averaged over all plans."""
+        """Return the action of this step (7,), from the newest plan or averaged over all plans.
+
+        Where a delay and `execute` reach beyond a plan's end, its last action is repeated.
+        """
         held = [
-            plan[episode.tick - tick]
-            for tick, plan in episode.plans
-            if episode.tick - tick < len(plan)
-        ]
+            plan[episode.tick - begin]
+            for begin, plan in episode.plans
+            if episode.tick - begin < len(plan)
+        ] or [episode.plans[-1][1][-1]]
         if self._policy.ensemble is None:
             newest: NDArray[np.float32] = held[-1]
             return newest

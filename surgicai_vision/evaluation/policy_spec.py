@@ -19,6 +19,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import (
     JSON,
+    STEPS,
     TaskConfig,
     digest,
     from_mapping,
@@ -386,7 +387,10 @@ def acting_agent(
     """
     policy = policies.load_policy(folder, changes)
     agent = _agent_of(policy, weights)
-    return ChunkAgent(policy, agent) if isinstance(policy, ChunkPolicy) else agent
+    if not isinstance(policy, ChunkPolicy):
+        return agent
+    translation, _, _ = STEPS[policy.checkpoint.task.step]
+    return ChunkAgent(policy, agent, translation)
 
 
 def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent:

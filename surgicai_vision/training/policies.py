@@ -56,6 +56,7 @@ POLICIES: Final = Registry["Plugin"](
     POLICIES_GROUP,
     {
         "bc": "policies.bc:BC",
+        "bc-chunk": "policies.bc_chunk:BC_CHUNK",
         "hlp": "policies.hlp:HLP",
         "actor": "policies.actor:ACTOR",
         "bcq": "policies.actor:BCQ",

@@ -31,7 +31,10 @@ TERMINATIONS = ("privileged", "learned")
 """How a subtask ends under a hierarchical policy."""
 BUDGET = "minutes"
 """Recipe setting that limits the training time (`policies.chunks.ChunkRecipe`)."""
-ACTED_BY = ("speed", "jaw_speed", "clock_speed", "execute", "samples", "ensemble")
+ACTED_BY = (
+    *("speed", "jaw_speed", "clock_speed"),
+    *("execute", "samples", "ensemble", "measure_delay"),
+)
 """Settings of a recipe that do not affect what is learned: speeds, and how chunks are executed."""
 
 

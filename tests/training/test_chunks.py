@@ -17,10 +17,11 @@ from torch import nn
 
 from policies.base import ACTIONS, Plugin, Recipe
 from policies.bc import BC
+from policies.bc_chunk import BC_CHUNK, BCChunkRecipe
 from policies.chunks import ChunkPolicy, ChunkRecipe
 from policies.lerobot import DIFFUSION, VQBET
 from surgicai_vision.core import names
-from surgicai_vision.core.config import FULL_SPEED, Pace, TaskConfig
+from surgicai_vision.core.config import FULL_SPEED, Pace, TaskConfig, clock
 from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.lazy import LazyMapping
@@ -41,6 +42,8 @@ from surgicai_vision.training.request import TrainingRequest
 from surgicai_vision.training.run_config import RunConfig, of_training
 from surgicai_vision.training.train import epochs_within, train
 
+STEP = 0.5e-3
+"""Way that an action of 1 commands in a control step [m]."""
 QUICK = ChunkRecipe(epochs=8, batch_size=32, learning_rate=1e-2, chunk=4, execute=2, history=2)
 
 
@@ -238,7 +241,7 @@ def test_how_chunks_are_acted_is_changed_without_a_training(
     )
     for change, error, said in (
         ({"execute": 9}, InputError, "1 to chunk, 4"),
-        ({"chunk": 2}, UnknownName, "clock_speed, ensemble, execute, jaw_speed, samples, speed"),
+        ({"chunk": 2}, UnknownName, "jaw_speed, measure_delay, samples"),
         ({"excute": 1}, UnknownName, "Did you mean 'execute'"),
     ):
         with pytest.raises(error, match=said):
@@ -371,7 +374,7 @@ def acting(
 
     policy.plan = plan  # type: ignore[method-assign,assignment]
     senses = PolicyAgent("linear", policy, None, (), 32, action_repeat=action_repeat, pace=pace)
-    return ChunkAgent(policy, senses), seeds
+    return ChunkAgent(policy, senses, STEP), seeds
 
 
 class Brightness:
@@ -420,6 +423,40 @@ def test_a_chunk_is_executed_at_the_policy_s_speed() -> None:
     assert moved(agent, 7) == [action / 2 for action in whole]
 
 
+@pytest.mark.parametrize("execute", [1, 3])
+@pytest.mark.parametrize("action_repeat", [1, 2])
+@pytest.mark.parametrize("delay", range(5))
+def test_where_actions_are_late_the_same_ones_are_sent(
+    delay: int, action_repeat: int, execute: int
+) -> None:
+    """The policy knows from where the arm is what follows, and the arm follows late."""
+    actions = np.random.default_rng(3).uniform(0.2, 1.0, 60).astype(np.float32)
+    way = STEP * action_repeat * np.concatenate([[0.0], np.cumsum(actions)])
+    recipe = replace(QUICK, chunk=8, execute=execute, history=1, clock=True, measure_delay=True)
+    policy = Linear(recipe, ())
+    clocks: list[np.ndarray] = []
+
+    def plan(features: None, vectors: np.ndarray, seed: int) -> np.ndarray:
+        at = int(np.abs(way - vectors[0, 0, 0]).argmin())
+        clocks.append(vectors[0, 0, ACTIONS:])
+        return np.repeat(actions[None, at : at + recipe.chunk, None], ACTIONS, axis=2)
+
+    policy.plan = plan  # type: ignore[method-assign,assignment]
+    inputs = (names.STATE, names.CLOCK)
+    senses = PolicyAgent("late", policy, None, (), 32, inputs, action_repeat=action_repeat)
+    agent = ChunkAgent(policy, senses, STEP)
+    agent.reset(0, None, 0)
+    sent: list[float] = []
+    for step in range(40):
+        moved = float(way[max(0, step - delay)])
+        arm = SimpleNamespace(agent_pos=lambda moved=moved: np.full(7, moved, np.float32))
+        sent.append(float(agent.act([0], [arm], [{}])[0, 0]))
+    np.testing.assert_array_equal(sent, actions[:40])
+    # The clock is that of the observation, which is late as well.
+    seen = [max(0, step - delay) * action_repeat for step in range(0, 40, execute)]
+    np.testing.assert_allclose(clocks, clock(np.array(seen)), atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("execute", "spacing", "history"), [(8, 5, 2), (3, 2, 3), (2, 5, 3), (4, 1, 1)]
 )
@@ -436,7 +473,7 @@ def test_images_are_looked_at_while_they_can_be_shown(
         return np.zeros((1, recipe.chunk, ACTIONS), np.float32)
 
     policy.plan = plan  # type: ignore[method-assign,assignment]
-    agent = ChunkAgent(policy, PolicyAgent("seeing", policy, Brightness(), ("front",), 4))
+    agent = ChunkAgent(policy, PolicyAgent("seeing", policy, Brightness(), ("front",), 4), STEP)
     agent.reset(0, None, 0)
     arm = SimpleNamespace(agent_pos=lambda: np.full(7, arm.step, np.float32), step=0)
     looked_at = []
@@ -457,6 +494,34 @@ def test_images_are_looked_at_while_they_can_be_shown(
     ahead = range(0, 20 + spacing * history, execute)
     seen = {max(0, tick - back * spacing) for tick in ahead for back in range(history)}
     assert looked_at == sorted(step for step in seen if step < 20)
+
+
+def test_bc_chunk_learns_every_planned_action_and_no_padding() -> None:
+    recipe = BCChunkRecipe(hidden=(64,), batch_norm=False, chunk=3)
+    torch.manual_seed(0)
+    policy = BC_CHUNK.make(recipe, ((DIM,),))
+    assert isinstance(policy, ChunkPolicy)
+    observed = torch.randn(48, policy.inputs.dim)
+    target = torch.cat([torch.rand(48, 3, ACTIONS) - 0.5, torch.zeros(48, 3, 1)], dim=2)
+    padded = target.clone()
+    padded[:, 2, ACTIONS] = 1.0
+    padded[:, 2, :ACTIONS] = 9.0
+    policy.measure(padded)
+    errors = (policy._chunks(observed) - target[..., :ACTIONS]) ** 2
+    assert policy.loss(observed, target).item() == pytest.approx(errors.mean().item())
+    assert policy.loss(observed, padded).item() == pytest.approx(errors[:, :2].mean().item())
+    optimiser = torch.optim.Adam(policy.parameters(), 1e-2)
+    for _ in range(400):
+        optimiser.zero_grad()
+        policy.loss(observed, target).backward()
+        optimiser.step()
+    np.testing.assert_allclose(policy._chunks(observed).detach(), target[..., :ACTIONS], atol=0.15)
+
+
+@pytest.mark.parametrize("given", [{"history": 2}, {"settings": {"dim_model": 64}}])
+def test_bc_chunk_refuses_what_its_network_has_not(given: dict[str, object]) -> None:
+    with pytest.raises(InputError, match="bc-chunk sees one observation"):
+        BCChunkRecipe(**given)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("samples", [1, 3])
