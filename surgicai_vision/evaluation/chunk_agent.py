@@ -176,7 +176,9 @@ class ChunkAgent(Agent):
                 episode.seed * SEED_STRIDE + episode.tick,
             )[0]
             kept = [(at, plan) for at, plan in episode.plans if episode.tick - at < len(plan)]
-            episode.plans = [*kept, (episode.tick - episode.late, chunk)]
+            # A slower arm has come less far in the same time.
+            ahead = round(episode.late * self._senses.pace.speed)
+            episode.plans = [*kept, (episode.tick - ahead, chunk)]
 
     def _history(self, episode: _Episode) -> list[_Moment]:
         """Return the moments that the policy sees, the present one last.

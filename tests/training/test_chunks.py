@@ -457,6 +457,23 @@ def test_where_actions_are_late_the_same_ones_are_sent(
     np.testing.assert_allclose(clocks, clock(np.array(seen)), atol=1e-6)
 
 
+def test_an_arm_at_half_speed_is_half_as_far_ahead() -> None:
+    recipe = replace(QUICK, chunk=8, execute=1, history=1, measure_delay=True)
+    policy = Linear(recipe, ())
+    steps = np.linspace(0.1, 0.8, 8, dtype=np.float32)
+    policy.plan = lambda *_: np.tile(steps[None, :, None], (1, 1, 7))  # type: ignore[method-assign]
+    senses = PolicyAgent("late", policy, None, (), 32, pace=Pace(speed=0.5))
+    agent = ChunkAgent(policy, senses, STEP)
+    agent.reset(0, None, 0)
+    way = [0.0]
+    for step in range(20):
+        moved = STEP * way[max(0, step - 4)]
+        arm = SimpleNamespace(agent_pos=lambda moved=moved: np.full(7, moved, np.float32))
+        action = agent.act([0], [arm], [{}])[0, 0]
+        way.append(way[-1] + float(action))
+    assert action == pytest.approx(0.5 * steps[2]), "four steps late, two of the plan's"
+
+
 @pytest.mark.parametrize(
     ("execute", "spacing", "history"), [(8, 5, 2), (3, 2, 3), (2, 5, 3), (4, 1, 1)]
 )
