@@ -61,8 +61,9 @@ class Options:
             and --noise.
         jaw_noise: Standard deviation of the noise on the jaw's motion while it is not commanded to
             close.
-        aim_noise: Standard deviation of how far past the grasp the tool aims, along the needle, in
-            half of all periods of 25 control steps [mm] (grasp and handoff); labels stay right.
+        aim_noise: Standard deviation of how far past the grasp, along the needle, or beside the
+            entry the tool aims in half of all periods of 25 control steps [mm] (grasp, handoff,
+            insert); labels stay right.
         perturb_start_fraction: Share of episodes that start with an unrecorded random motion.
         upset_fraction: Share of episodes in which something goes wrong once: the needle is pushed,
             or jaws open (docs/demos.md).

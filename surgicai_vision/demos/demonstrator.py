@@ -10,7 +10,7 @@ of it for a while; the labels remain the demonstrator's.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,22 @@ from surgicai_vision.core.plugins import resolve
 
 if TYPE_CHECKING:
     from surgicai_vision.envs.base import Observation, SuturingEnv
+
+
+class Miss(NamedTuple):
+    """How far beside its goal a demonstrator aims.
+
+    Attributes:
+        along: past a grasp, along the needle towards its tip, or beside the entry of an insertion,
+            along the wound [m].
+        across: beside the entry, across the wound in the entry's plane [m]; a grasp ignores it.
+    """
+
+    along: float = 0.0
+    across: float = 0.0
+
+
+ON_AIM = Miss()
 
 
 class Demonstrator(ABC):
@@ -51,12 +67,12 @@ class Demonstrator(ABC):
     def action(self) -> NDArray[np.float32]:
         """Return the action for the env's present state, (7,) in [-1, 1]."""
 
-    def missing(self, shift: float) -> NDArray[np.float32]:
-        """Return the action with which a grasp would miss, (7,) in [-1, 1].
+    def missing(self, miss: Miss) -> NDArray[np.float32]:
+        """Return the action with which a grasp or an insertion would miss, (7,) in [-1, 1].
 
         Args:
-            shift: how far past the grasp it aims, along the needle towards its tip [m]. A
-                demonstrator that cannot miss (`AIMING_DEMONSTRATORS`) ignores it.
+            miss: how far beside its goal it aims. A demonstrator that cannot miss
+                (`AIMING_DEMONSTRATORS`) ignores it.
         """
         return self.action()
 

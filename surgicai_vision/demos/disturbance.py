@@ -3,7 +3,9 @@
 `surgicai_vision.demos.rollout` explains what each kind is for, and runs an episode with it.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import CLOCK_PERIOD, TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.demonstrator import ON_AIM, Miss
 
 if TYPE_CHECKING:
     from surgicai_vision.envs.base import SuturingEnv
@@ -19,11 +22,11 @@ if TYPE_CHECKING:
 PERTURBATION_STEPS = (8, 25)
 """Fewest and most control steps of a perturbation: 4 to 12 mm at the paper's step size."""
 AIM_STEPS = CLOCK_PERIOD
-"""Control steps for which a tool aims past the grasp: one attempt of `demos.search_expert`."""
+"""Control steps for which a tool aims beside its goal: one attempt of `demos.search_expert`."""
 AIM_SHARE = 0.5
 """Share of these periods in which it does; in the others it aims right."""
 MOST_AIM_NOISE = 5.0
-"""Largest standard deviation of the aim [mm]; the needle's arc is 21 mm long."""
+"""Largest standard deviation of the aim [mm]; the needle's arc is 21 mm long, an opening 3.8."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,12 @@ class Disturbance:
             Without this noise, open jaws are always exactly as open as the demonstrator holds them,
             and a policy never sees how to reopen jaws that have closed a little
             (docs/results/unmoved-trials.md).
-        aim_noise: standard deviation of how far past the grasp, along the needle, the executed
-            motions aim [mm]. It is drawn anew every `AIM_STEPS`, and in `AIM_SHARE` of them. Noise
-            of single steps is corrected at once, so that it shows few states that are far off, and
-            a policy that comes to one repeats the demonstrated motion from there
-            (docs/results/unmoved-trials.md). The jaw follows the label.
+        aim_noise: standard deviation of how far beside their goal the executed motions aim [mm]:
+            past a grasp, along the needle, or beside the entry of an insertion, in both directions
+            of its plane (`demonstrator.Miss`). It is drawn anew every `AIM_STEPS`, and in
+            `AIM_SHARE` of them. Noise of single steps is corrected at once, so that it shows few
+            states that are far off, and a policy that comes to one repeats the demonstrated motion
+            from there (docs/results/unmoved-trials.md). The jaw follows the label.
         late: the most control steps by which a demonstrator that goes back notices a loss late;
             each episode draws its own. It shows the behaviour of a policy that has not noticed yet.
     """
@@ -108,10 +112,10 @@ class Disturbance:
             return self.noise
         return float(rng.uniform(self.noise_from, self.noise))
 
-    def draw_aim(self, rng: np.random.Generator) -> float:
-        """Return how far past the grasp the motions of the next `AIM_STEPS` aim [m]."""
-        shift = float(rng.normal(0.0, self.aim_noise * 1e-3))
-        return shift if rng.random() < AIM_SHARE else 0.0
+    def draw_aim(self, task: str, rng: np.random.Generator) -> Miss:
+        """Return how far beside the goal of `task` the motions of the next `AIM_STEPS` aim."""
+        shifts = rng.normal(0.0, self.aim_noise * 1e-3, AIMING_TASKS[task])
+        return Miss(*shifts.tolist()) if rng.random() < AIM_SHARE else ON_AIM
 
     def draw_late(self, rng: np.random.Generator) -> int:
         """Return by how many control steps an episode's demonstrator notices a loss late."""
@@ -137,9 +141,11 @@ class Disturbance:
 UNDISTURBED = Disturbance()
 
 AIMING_DEMONSTRATORS = ("expert", "search")
-"""Those that can aim past the grasp (`Demonstrator.missing`)."""
-AIMING_TASKS = ("grasp", "handoff", names.SUTURE)
-"""The tasks in which a needle is grasped."""
+"""Those that can aim beside their goal (`Demonstrator.missing`)."""
+AIMING_TASKS: Mapping[str, int] = MappingProxyType(
+    {"grasp": 1, "handoff": 1, "insert": 2, names.SUTURE: 1}
+)
+"""The tasks in which a goal can be missed → in how many directions (`demonstrator.Miss`)."""
 
 RETURNING_DEMONSTRATORS = ("recover",)
 """Those that go back after a loss, and so can notice it late."""
@@ -160,7 +166,7 @@ def check_late(demonstrator: str, disturbance: Disturbance) -> None:
 
 
 def check_aim(demonstrator: str, task: str, disturbance: Disturbance) -> None:
-    """Refuse `aim_noise` where nothing is grasped, or by a demonstrator that cannot miss.
+    """Refuse `aim_noise` where no goal can be missed, or by a demonstrator that cannot miss.
 
     Raises:
         InputError: it is set for such a task or demonstrator.
@@ -169,13 +175,13 @@ def check_aim(demonstrator: str, task: str, disturbance: Disturbance) -> None:
         return
     if task not in AIMING_TASKS:
         raise InputError(
-            f"aim_noise is {disturbance.aim_noise:g}, but task '{task}' grasps nothing; leave it "
-            f"out or use task {', '.join(AIMING_TASKS)}."
+            f"aim_noise is {disturbance.aim_noise:g}, but task '{task}' has no goal to miss; leave "
+            f"it out or use task {', '.join(AIMING_TASKS)}."
         )
     if demonstrator not in AIMING_DEMONSTRATORS:
         raise InputError(
             f"aim_noise is {disturbance.aim_noise:g}, but demonstrator '{demonstrator}' cannot "
-            f"aim past the grasp; leave it out or use demonstrator "
+            f"aim beside its goal; leave it out or use demonstrator "
             f"{', '.join(AIMING_DEMONSTRATORS)}."
         )
 

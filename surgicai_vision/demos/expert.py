@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError, UnreachablePose
 from surgicai_vision.core.plugins import resolve
-from surgicai_vision.demos.demonstrator import Demonstrator
+from surgicai_vision.demos.demonstrator import ON_AIM, Demonstrator, Miss
 from surgicai_vision.envs import control, poses
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.control import StepSize
@@ -117,11 +117,11 @@ class Expert(Demonstrator):
 
     def label(self) -> NDArray[np.float32]:
         """Return the action without noise: the label of the present state, (7,)."""
-        return self.missing(0.0)
+        return self.missing(ON_AIM)
 
-    def missing(self, shift: float) -> NDArray[np.float32]:
-        """Return the label, (7,), were the goal of a grasp `shift` further along the needle [m]."""
-        world = WorldState(self.env, shift)
+    def missing(self, miss: Miss) -> NDArray[np.float32]:
+        """Return the label, (7,), were the goal of a grasp, or of an insertion, elsewhere."""
+        world = WorldState(self.env, miss)
         return action_towards(world, _rule(self.env.subtask)(world))
 
 
@@ -130,11 +130,12 @@ class WorldState:
 
     Args:
         env: the env.
-        shift: how far past its goal a grasp aims, along the needle towards its tip [m].
+        miss: how far beside its goal a grasp or an insertion aims.
 
     Attributes:
         arm: the active arm.
-        stitch: the path through the holes.
+        stitch: the path through the holes, as far beside them as an insertion aims whose needle is
+            in no hole yet.
         task_state: the task's state beyond MuJoCo's.
         step: the step sizes of an action.
         base: T_world_base of the active arm.
@@ -145,15 +146,17 @@ class WorldState:
         command: T_world_tip that this command really means.
         command_jaw: commanded jaw angle [rad].
         holds: whether the active arm's jaws hold the needle.
-        miss: `shift` as an angle of the needle [rad].
+        miss: how far past its goal a grasp aims, as an angle of the needle [rad].
     """
 
-    def __init__(self, env: SuturingEnv, shift: float = 0.0):
+    def __init__(self, env: SuturingEnv, miss: Miss = ON_AIM):
         simulation = env.simulation
         self.arm = env.subtask.arm
-        self.stitch: Stitch = env.stitch
-        self.miss = shift / self.stitch.radius
         self.task_state = simulation.task_state
+        self.stitch: Stitch = env.stitch
+        if env.subtask.name == "insert" and self.task_state.holes_passed == 0:
+            self.stitch = self.stitch.beside(*miss)
+        self.miss = miss.along / self.stitch.radius
         self.step = StepSize.of(env.config.step)
         self.base = poses.square(simulation.bases[self.arm])
         self.instrument = env.config.scene.instrument

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.files import code_version
-from surgicai_vision.demos.demonstrator import BehaviourPolicy, Demonstrator
+from surgicai_vision.demos.demonstrator import ON_AIM, BehaviourPolicy, Demonstrator
 from surgicai_vision.demos.disturbance import AIM_STEPS, UNDISTURBED, Disturbance
 from surgicai_vision.demos.store import Demo
 from surgicai_vision.envs.upset import Upset, plan_upset
@@ -157,7 +157,7 @@ def rollout(
         env.reset(seed=seed)  # the perturbation ended the episode; this start is left unperturbed
     deviation = disturbance.draw_deviation(rng)
     is_noisy = bool(disturbance.noise or disturbance.jaw_noise or disturbance.aim_noise)
-    shift = 0.0
+    miss = ON_AIM
     demonstrator.late = disturbance.draw_late(rng)
     observation = env.observe() if behaviour else None
     if behaviour:
@@ -177,13 +177,15 @@ def rollout(
             recorder.restate()
             observation = env.observe() if behaviour else None
         if disturbance.aim_noise and len(recorder) % AIM_STEPS == 0:
-            shift = disturbance.draw_aim(rng)
+            miss = disturbance.draw_aim(env.task, rng)
         executed = None
         if behaviour and observation is not None:
             executed = behaviour.action(env, observation)
         if executed is None:
             # The jaw follows the label: a tool that aims past the grasp does not close there.
-            acted = np.append(demonstrator.missing(shift)[:6], label[6]) if shift else label
+            acted = label
+            if miss != ON_AIM:
+                acted = np.append(demonstrator.missing(miss)[:6], label[6])
             executed = disturbance.disturb(acted, deviation, rng) if is_noisy else label
         recorder.step(upset.altered(executed), label)
         observation = recorder.observation

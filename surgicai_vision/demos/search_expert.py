@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.config import CLOCK_PERIOD
-from surgicai_vision.demos.demonstrator import Demonstrator
+from surgicai_vision.demos.demonstrator import ON_AIM, Demonstrator, Miss
 from surgicai_vision.demos.expert import (
     HOVER,
     OPEN_ABOVE,
@@ -65,13 +65,13 @@ class SearchExpert(Demonstrator):
 
     def action(self) -> NDArray[np.float32]:
         """Return the next action for the env's present state, (7,) in [-1, 1]."""
-        return self.missing(0.0)
+        return self.missing(ON_AIM)
 
-    def missing(self, shift: float) -> NDArray[np.float32]:
-        """Return the action, (7,), were every attempt `shift` further along the needle [m]."""
+    def missing(self, miss: Miss) -> NDArray[np.float32]:
+        """Return the action, (7,), were every attempt that much further along the needle."""
         if self.env.subtask.name != "grasp":
-            return self._expert.missing(shift)
-        world = WorldState(self.env, shift)
+            return self._expert.missing(miss)
+        world = WorldState(self.env, miss)
         return action_towards(world, self._target(world, self.env.simulation.task_state.steps))
 
     def _target(self, world: WorldState, step: int) -> ToolTarget:

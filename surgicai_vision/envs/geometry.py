@@ -30,6 +30,7 @@ its base. Those holes are meant for their challenge's needle of 133°. In `3dmed
 possible; the later subtasks are refused.
 """
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -42,7 +43,7 @@ from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.envs import poses
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_WIDTH
-from surgicai_vision.scene.holes import HolePair
+from surgicai_vision.scene.holes import Hole, HolePair
 from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import rotvec_to_matrix, rpy_to_matrix
 
@@ -108,6 +109,12 @@ def needle_frame_flat(angle: float, radius: float) -> Pose:
     return poses.flat(needle_frame(angle, radius))
 
 
+def _moved(hole: Hole, shift: Matrix) -> Hole:
+    """Return a hole moved by `shift` (3,) [m]."""
+    x, y, z = (np.asarray(hole.centre) + shift).tolist()
+    return dataclasses.replace(hole, centre=(x, y, z))
+
+
 @dataclass(frozen=True)
 class Stitch:
     """The path of the needle through one pair of holes, all poses T_world_needle (4, 4).
@@ -150,6 +157,15 @@ class Stitch:
         up = cross(chord / (2 * half), pair.entry.rotation[:, 1])
         centre = (entry + leave) / 2 + up * math.sqrt(radius**2 - half**2)
         return cls(pair, centre, math.asin(half / radius), radius, tip_angle)
+
+    def beside(self, along: float, across: float) -> "Stitch":
+        """Return the path moved along the wound and across it, in the entry's plane [m]."""
+        if not (along or across):
+            return self
+        axes = self.pair.entry.rotation
+        shift = along * axes[:, 1] + across * axes[:, 0]
+        pair = HolePair(_moved(self.pair.entry, shift), _moved(self.pair.exit, shift))
+        return dataclasses.replace(self, pair=pair, centre=self.centre + shift)
 
     @functools.cached_property
     def wound(self) -> Matrix:

@@ -39,7 +39,7 @@ class Demonstrations:
         demonstrator: who demonstrates.
         noise: noise on the actions that the demonstrator executes (`Disturbance`).
         jaw_noise: noise on the jaw's motion while it is not told to close.
-        aim_noise: how far past the grasp the tool aims now and then [mm].
+        aim_noise: how far beside the grasp or the entry the tool aims now and then [mm].
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
         late: largest delay [control steps] with which a demonstrator that goes back notices a loss.
         post_success_steps: control steps an episode goes on after its success.
@@ -147,7 +147,7 @@ class Demonstrations:
         parts = [who]
         parts += [f"executed with noise {self.noise:g}"] if self.noise else []
         parts += [f"its open jaws with noise {self.jaw_noise:g}"] if self.jaw_noise else []
-        parts += [f"aiming past the grasp by {self.aim_noise:g} mm"] if self.aim_noise else []
+        parts += [f"aiming off by {self.aim_noise:g} mm"] if self.aim_noise else []
         parts += [f"upset in {self.upset_fraction:.0%}"] if self.upset_fraction else []
         parts += [f"noticed up to {self.late} steps late"] if self.late else []
         parts += [f"going on for {after} steps after their success"] if after else []

@@ -175,10 +175,37 @@ def test_labels_and_jaws_stay_right_where_the_tool_misses(task, demonstrator):
         np.testing.assert_array_equal(demonstrator(env).action(), demo.action[step])
 
 
-def test_where_nothing_is_grasped_no_tool_misses(tmp_path):
+def test_a_needle_that_is_pressed_beside_the_entry_is_lifted_off_and_lined_up_again():
+    """Without it no demonstration shows the tip on the tissue beside the opening, 1.9 mm wide."""
+    with envs.make(TaskConfig("insert"), obs_type="state") as env:
+        calm, missing = (
+            [rollout(env, Expert(env), seed, disturbance=disturbance) for seed in range(8)]
+            for disturbance in (Disturbance(0.3), Disturbance(0.3, aim_noise=2.0))
+        )
+        assert all(one.success for one in calm)
+        assert all(_beside_the_entry(env, one.demo) < 1.9e-3 for one in calm)
+        recovered = [one for one in missing if one.success]
+        assert sum(_beside_the_entry(env, one.demo) > 1.9e-3 for one in recovered) >= 3
+
+
+def _beside_the_entry(env: envs.SuturingEnv, demo: Demo) -> float:
+    """Return how far beside the entry the tip is at most where it touches the tissue [m]."""
+    most = 0.0
+    for state in demo.state:
+        env.set_state_vector(state)
+        world = WorldState(env)
+        tip = (world.needle @ np.append(needle.point(world.stitch.tip_angle), 1.0))[:3]
+        entry = world.stitch.pair.entry
+        x, y, z = entry.rotation.T @ (tip - np.asarray(entry.centre))
+        if z < 0.25e-3 and not world.task_state.holes_passed:
+            most = max(most, math.hypot(x, y))
+    return most
+
+
+def test_where_nothing_can_be_missed_no_tool_misses(tmp_path):
     for task, demonstrator, told in (
-        ("place", "expert", "grasps nothing"),
-        ("suture", "recover", "'recover' cannot aim past"),
+        ("place", "expert", "no goal to miss"),
+        ("suture", "recover", "'recover' cannot aim beside"),
     ):
         with pytest.raises(InputError, match=told):
             record(
