@@ -62,7 +62,7 @@ class Options:
         jaw_noise: Standard deviation of the noise on the jaw's motion while it is not commanded to
             close.
         aim_noise: Standard deviation of how far past the grasp, along the needle, or beside the
-            entry the tool aims in half of all periods of 25 control steps [mm] (grasp, handoff,
+            holes the tool aims in half of all periods of 25 control steps [mm] (grasp, handoff,
             insert); labels stay right.
         perturb_start_fraction: Share of episodes that start with an unrecorded random motion.
         upset_fraction: Share of episodes in which something goes wrong once: the needle is pushed,

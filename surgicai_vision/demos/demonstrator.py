@@ -26,9 +26,9 @@ class Miss(NamedTuple):
     """How far beside its goal a demonstrator aims.
 
     Attributes:
-        along: past a grasp, along the needle towards its tip, or beside the entry of an insertion,
+        along: past a grasp, along the needle towards its tip, or beside the path of an insertion,
             along the wound [m].
-        across: beside the entry, across the wound in the entry's plane [m]; a grasp ignores it.
+        across: beside that path, across the wound in the entry's plane [m]; a grasp ignores it.
     """
 
     along: float = 0.0

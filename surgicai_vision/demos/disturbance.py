@@ -47,8 +47,8 @@ class Disturbance:
             and a policy never sees how to reopen jaws that have closed a little
             (docs/results/unmoved-trials.md).
         aim_noise: standard deviation of how far beside their goal the executed motions aim [mm]:
-            past a grasp, along the needle, or beside the entry of an insertion, in both directions
-            of its plane (`demonstrator.Miss`). It is drawn anew every `AIM_STEPS`, and in
+            past a grasp, along the needle, or beside the path of an insertion, in both directions
+            of the entry's plane (`demonstrator.Miss`). It is drawn anew every `AIM_STEPS`, and in
             `AIM_SHARE` of them. Noise of single steps is corrected at once, so that it shows few
             states that are far off, and a policy that comes to one repeats the demonstrated motion
             from there (docs/results/unmoved-trials.md). The jaw follows the label.

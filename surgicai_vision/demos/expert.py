@@ -135,7 +135,7 @@ class WorldState:
     Attributes:
         arm: the active arm.
         stitch: the path through the holes, as far beside them as an insertion aims whose needle is
-            in no hole yet.
+            not through both yet.
         task_state: the task's state beyond MuJoCo's.
         step: the step sizes of an action.
         base: T_world_base of the active arm.
@@ -154,7 +154,7 @@ class WorldState:
         self.arm = env.subtask.arm
         self.task_state = simulation.task_state
         self.stitch: Stitch = env.stitch
-        if env.subtask.name == "insert" and self.task_state.holes_passed == 0:
+        if env.subtask.name == "insert" and self.task_state.holes_passed < 2:
             self.stitch = self.stitch.beside(*miss)
         self.miss = miss.along / self.stitch.radius
         self.step = StepSize.of(env.config.step)

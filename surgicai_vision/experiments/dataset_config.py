@@ -39,7 +39,7 @@ class Demonstrations:
         demonstrator: who demonstrates.
         noise: noise on the actions that the demonstrator executes (`Disturbance`).
         jaw_noise: noise on the jaw's motion while it is not told to close.
-        aim_noise: how far beside the grasp or the entry the tool aims now and then [mm].
+        aim_noise: how far beside the grasp or the holes the tool aims now and then [mm].
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
         late: largest delay [control steps] with which a demonstrator that goes back notices a loss.
         post_success_steps: control steps an episode goes on after its success.
