@@ -353,7 +353,7 @@ def test_a_file_is_tried_small_beside_the_whole(tmp_path, monkeypatch, capsys):
         ),
         (
             {"demonstrations": [{**TABLE["demonstrations"][1], "aim_noise": 1.0}]},
-            "'place' grasps nothing",
+            "'place' has no goal to miss",
         ),
         ({"policies": [{**TABLE["policies"][0], "view": ["front"]}]}, "'front'"),
         ({"policies": [{**TABLE["policies"][0], "part": "grsp"}]}, "'grasp'"),
