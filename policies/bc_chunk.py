@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from policies.base import ACTIONS, Plugin, Recipe
-from policies.chunks import ChunkPolicy, ChunkRecipe
+from policies.chunks import ChunkPolicy, ChunkRecipe, planned_offsets
 from policies.layers import mlp
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
@@ -43,12 +43,9 @@ class BCChunkPolicy(ChunkPolicy):
     """The MLP of behaviour cloning, with an answer for each planned step."""
 
     def __init__(self, recipe: BCChunkRecipe, visual: tuple[tuple[int, ...], ...]):
-        super().__init__(recipe, visual, "mean_std")
+        super().__init__(recipe, visual, "none")
         width = self.heads.dim + self.inputs.width
         self.network = mlp(recipe, width, self.chunk * ACTIONS)
-
-    def measure(self, target: torch.Tensor) -> None:
-        """Learn the actions as they are, in [-1, 1]."""
 
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
         """Return actions (B, chunk, 7) in [-1, 1]; see `ChunkPolicy`."""
@@ -73,10 +70,4 @@ def _make(recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> BCChunkPolicy:
     return BCChunkPolicy(recipe, visual)
 
 
-def _offsets(recipe: Recipe) -> range:
-    """Return the offsets of the learned actions: from the present step on."""
-    assert isinstance(recipe, BCChunkRecipe)
-    return range(recipe.chunk)
-
-
-BC_CHUNK = Plugin("bc-chunk", BCChunkRecipe, _make, names.ACTION_CHUNK, _offsets)
+BC_CHUNK = Plugin("bc-chunk", BCChunkRecipe, _make, names.ACTION_CHUNK, planned_offsets)

@@ -11,7 +11,8 @@ Interface:
 * `ChunkPolicy`: abstract. `policy.plan(features (B, h, F) | None, vectors (B, h, n), seed)` →
   (B, chunk, 7) in [-1, 1], for observations of `history` moments h, the present one last.
 * A member implements `plan_normalised` and `chunk_loss`. It gets actions normalised over the
-  training frames in the way of LeRobot's normalisers: "mean_std" or "min_max" (to [-1, 1]).
+  training frames in the way of LeRobot's normalisers, "mean_std" or "min_max" (to [-1, 1]), or as
+  they are ("none").
 
 `surgicai_vision.training.chunks` builds the column of chunks;
 `surgicai_vision.evaluation.chunk_agent` executes chunks. Members: `bc-chunk`, and LeRobot's `act`,
@@ -33,7 +34,7 @@ from policies.layers import FeatureHeads
 from surgicai_vision.core.config import JSON, LATER
 from surgicai_vision.core.errors import InputError, check_at_least, check_at_most, check_name, shown
 
-NORMALISATIONS = ("mean_std", "min_max")
+NORMALISATIONS = ("mean_std", "min_max", "none")
 MOST_PLANNED = 1_000
 """Maximum actions of a chunk, moments of a history and samples per plan: a whole procedure."""
 SMALLEST_RANGE = 1e-6
@@ -90,6 +91,12 @@ class ChunkRecipe(Recipe):
                 raise InputError(f"settings: {name} is {shown(value)}; give plain, finite data.")
         if not self.proprioception and not self.privileged:
             raise InputError("A policy that plans chunks needs proprioception; keep it on.")
+
+
+def planned_offsets(recipe: Recipe) -> range:
+    """Return the offsets of a chunk's actions that begin with the present one."""
+    assert isinstance(recipe, ChunkRecipe)
+    return range(recipe.chunk)
 
 
 def _is_plain(value: object) -> bool:
@@ -164,6 +171,8 @@ class ChunkPolicy(Policy, abc.ABC):
 
     def measure(self, target: torch.Tensor) -> None:
         """Store the statistics of the actions over the training frames; target (N, T, 8)."""
+        if self._normalisation == "none":
+            return
         actions = target[..., :ACTIONS][target[..., ACTIONS] == 0].double()
         if self._normalisation == "mean_std":
             centre = actions.mean(0)

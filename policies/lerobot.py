@@ -15,7 +15,7 @@ import io
 from collections.abc import Mapping
 
 from policies.base import Plugin, Policy, Recipe
-from policies.chunks import ChunkRecipe
+from policies.chunks import ChunkRecipe, planned_offsets
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError, check_positive, first_line
@@ -80,11 +80,6 @@ def _make(kind: str, recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> Pol
     return policy
 
 
-def _act_offsets(recipe: Recipe) -> range:
-    assert isinstance(recipe, ChunkRecipe)
-    return range(recipe.chunk)
-
-
 def _diffusion_offsets(recipe: Recipe) -> range:
     """Return offsets that begin one step back per earlier observation, as in LeRobot."""
     assert isinstance(recipe, ChunkRecipe)
@@ -100,7 +95,9 @@ def _vqbet_offsets(recipe: Recipe) -> range:
     return range(1 - recipe.history, tokens + recipe.chunk - 1)
 
 
-ACT = Plugin("act", ChunkRecipe, functools.partial(_make, "Act"), names.ACTION_CHUNK, _act_offsets)
+ACT = Plugin(
+    "act", ChunkRecipe, functools.partial(_make, "Act"), names.ACTION_CHUNK, planned_offsets
+)
 DIFFUSION = Plugin(
     "diffusion",
     ChunkRecipe,

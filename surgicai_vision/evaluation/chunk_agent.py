@@ -54,7 +54,6 @@ class _Episode:
         seed: the episode's.
         tick: actions since its subtask began.
         meter: measures the delay; None if it is not asked for.
-        late: by how many actions the observation of this step is behind the actions sent.
         past: the last moments, the present one last.
         plans: (tick at which its first action is due, its actions (chunk, 7)), the oldest first.
     """
@@ -63,8 +62,12 @@ class _Episode:
     past: deque[_Moment]
     tick: int = 0
     meter: DelayMeter | None = None
-    late: int = 0
     plans: list[tuple[int, NDArray[np.float32]]] = field(default_factory=list)
+
+    @property
+    def late(self) -> int:
+        """By how many actions the newest observation is behind those sent."""
+        return 0 if self.meter is None else min(self.meter.delay, self.tick)
 
 
 @final
@@ -97,17 +100,18 @@ class ChunkAgent(Agent):
 
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Forget everything; random numbers are drawn from `seed`."""
+        self._begin(slot, seed)
+
+    def _begin(self, slot: int, seed: int) -> None:
+        """Give the slot a new memory."""
         moments = (self._policy.history - 1) * self._spacing + 1
-        self._episodes[slot] = _Episode(seed, deque(maxlen=moments), meter=self._meter())
+        longest = self._policy.chunk - 1  # the delay that a chunk spans
+        meter = DelayMeter(self._step, longest) if self._policy.measure_delay else None
+        self._episodes[slot] = _Episode(seed, deque(maxlen=moments), meter=meter)
 
     def restart(self, slot: int) -> None:
         """Forget what the slot has planned and seen: its subtask begins."""
-        episode = self._episodes[slot]
-        episode.past.clear()
-        episode.plans.clear()
-        episode.tick = 0
-        episode.meter = self._meter()
-        episode.late = 0
+        self._begin(slot, self._episodes[slot].seed)
 
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
@@ -117,7 +121,6 @@ class ChunkAgent(Agent):
         for episode, robot in zip(episodes, robots, strict=True):
             if episode.meter is not None:
                 episode.meter.see(robot.agent_pos())
-                episode.late = min(episode.meter.delay, episode.tick)
         with one_thread():
             ticks = [episode.tick - episode.late for episode in episodes]
             vectors = self._senses.vectors(robots, observations, ticks)
@@ -132,11 +135,6 @@ class ChunkAgent(Agent):
             if episode.meter is not None:
                 episode.meter.send(action)
         return executed
-
-    def _meter(self) -> DelayMeter | None:
-        """Return a new meter, for delays that a chunk spans; None if none is asked for."""
-        longest = self._policy.chunk - 1
-        return DelayMeter(self._step, longest) if self._policy.measure_delay else None
 
     def _is_due(self, tick: int) -> bool:
         """Return True if a plan is made at `tick`: every `execute` actions, from 0 on."""

@@ -241,7 +241,11 @@ def test_how_chunks_are_acted_is_changed_without_a_training(
     )
     for change, error, said in (
         ({"execute": 9}, InputError, "1 to chunk, 4"),
-        ({"chunk": 2}, UnknownName, "jaw_speed, measure_delay, samples"),
+        (
+            {"chunk": 2},
+            UnknownName,
+            "clock_speed, ensemble, execute, jaw_speed, measure_delay, samples, speed",
+        ),
         ({"excute": 1}, UnknownName, "Did you mean 'execute'"),
     ):
         with pytest.raises(error, match=said):
