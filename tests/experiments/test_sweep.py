@@ -113,6 +113,39 @@ def test_a_killed_and_interrupted_sweep_ends_as_a_quiet_one(quiet, tmp_path):
     assert not (out / "work").exists()
 
 
+def test_a_training_that_was_interrupted_continues_in_the_next_call(tmp_path, monkeypatch):
+    grid = replace(BLIND, seed=(0,), demonstrations=(2,), epochs=12, expert=False)
+    quiet = sweep(grid, tmp_path / "quiet")
+    out = tmp_path / "out"
+    epochs = []
+
+    @contextmanager
+    def interrupted(title, unit):
+        def progress(done, total, unit=""):
+            if title.startswith("policy: ") and done == 7:
+                raise KeyboardInterrupt
+
+        yield progress
+
+    @contextmanager
+    def noted(title, unit):
+        def progress(done, total, unit=""):
+            if title.startswith("policy: "):
+                epochs.append(done)
+
+        yield progress
+
+    monkeypatch.setattr("surgicai_vision.experiments.sweep.jobs.silent_stage", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        sweep(grid, out)
+    assert not list(out.glob("runs/*"))
+    monkeypatch.setattr("surgicai_vision.experiments.sweep.jobs.silent_stage", noted)
+    again = sweep(grid, out)
+    assert epochs[0] == 5 and epochs[-1] == 12, "from the state that the interrupted call left"
+    assert again["digest"] == quiet["digest"]
+    assert not list((out / "training").iterdir()), "the state is removed with the result"
+
+
 def test_a_sweep_of_one_run_shares_its_episodes_among_the_workers(tmp_path, monkeypatch):
     grid = replace(BLIND, seed=(0,), demonstrations=(1,), episodes=3)
     alone = sweep(grid, tmp_path / "alone")

@@ -9,5 +9,6 @@ share), `references/` (expert, replay), `episodes.parquet` (one row per episode)
 `result.json` names the job, which depends on code and versions too. So running again does only what
 is missing or was made by other code. A run that failed is tried again; one whose weights are not
 available is reported as not run, with the reason. Finished jobs wait in `work/` until they are
-filed; nothing else is needed to continue after a kill.
+filed, and a training that was killed continues in `training/`; nothing else is needed to continue
+after a kill.
 """

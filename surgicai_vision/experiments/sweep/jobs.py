@@ -2,6 +2,10 @@
 
 Encode, train a policy that runs share, do a run, evaluate a reference. Each writes into its own
 folder and reads datasets and cache by path. Nothing here depends on which worker does it.
+
+A training works in `scratch`, a folder that no other job uses, and continues there if a killed
+sweep is run again. Its checkpoint is then copied to the job's own folder. The sweep removes
+`scratch` once the result is filed. A training by `lerobot-train` begins anew.
 """
 
 import dataclasses
@@ -39,6 +43,9 @@ from surgicai_vision.training.run_config import RunConfig, evaluated_in
 
 type Table = Mapping[str, JSON]
 
+POLICY = "policy"
+"""Folder of a checkpoint within a run's, and within the folder in which a training works."""
+
 
 def encode_features(
     folder: Path,
@@ -62,6 +69,7 @@ def train_policy(
     subtask: str | None,
     encodes_all: bool,
     demos: Sequence[str],
+    scratch: str,
     dataset: str,
     accept_licence: bool,
     device: str | None,
@@ -75,16 +83,18 @@ def train_policy(
     if subtask and not encodes_all:
         data = of_subtask(data, subtask)
         subtask = None
+    trained = Path(scratch) / POLICY
     train_run(
         _run(run),
         data,
-        folder,
+        trained,
         silent_stage,
         weights,
         subtask=subtask,
         demos=[Path(one) for one in demos],
         device=device,
     )
+    shutil.copytree(trained, folder, dirs_exist_ok=True)
 
 
 def train_and_evaluate(
@@ -95,6 +105,7 @@ def train_and_evaluate(
     env: Table,
     procedure: Table,
     processes: int,
+    scratch: str,
     dataset: str,
     accept_licence: bool,
     device: str | None,
@@ -118,8 +129,10 @@ def train_and_evaluate(
         elif policies:
             spec = open_policy(*policies.values(), task=what.task, weights=weights)
         else:
-            spec = _trained(what, _dataset(dataset), folder / "policy", measured, weights, device)
-            about["folder"] = str(Path(final) / "policy")
+            policy = folder / POLICY
+            _train(what, _dataset(dataset), policy, Path(scratch), measured, weights, device)
+            spec = open_policy(policy, task=what.task, weights=weights)
+            about["folder"] = str(Path(final) / POLICY)
         spec = in_env(spec, env)
         if what.detector:
             spec = aimed(spec, RELEASED)
@@ -169,21 +182,22 @@ def run_probe(
     write_json(folder / PROBE_FILE, {**row, **probe(data, features).row()})
 
 
-def _trained(
+def _train(
     run: RunConfig,
     dataset: RenderedDataset,
     policy: Path,
+    scratch: Path,
     stage: Stage,
     weights: WeightsSource,
     device: str | None,
-) -> PolicySpec:
-    """Train a run's policy and return it."""
+) -> None:
+    """Train a run's policy into the folder `policy`, or continue its training in `scratch`."""
     if run.by_lerobot_train:
         with stage("policy", "steps"):
             train_lerobot(run, dataset, policy, weights, device)
     else:
-        train_run(run, dataset, policy, stage, weights, device=device)
-    return open_policy(policy, task=run.task, weights=weights)
+        train_run(run, dataset, scratch / POLICY, stage, weights, device=device)
+        shutil.copytree(scratch / POLICY, policy)
 
 
 def evaluate_as(

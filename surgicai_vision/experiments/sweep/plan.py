@@ -266,6 +266,7 @@ class Jobs:
         self._where: dict[str, JSON] = {"command": command, "environment": dict(environment or {})}
         self._device = device
         self._digests: dict[str, str | None] = {}
+        self._recipes: dict[tuple[str, str, tuple[str, ...], bool], str] = {}
 
     def data_folder(self, name: str) -> Path:
         """Return where a dataset and its demonstrations are."""
@@ -331,7 +332,7 @@ class Jobs:
             "processes": processes,
             **self._common(dataset),
         }
-        return Job("sweep-run", arguments, tuple(inputs), label=RUN_LABELS)
+        return self._with_scratch(Job("sweep-run", arguments, tuple(inputs), label=RUN_LABELS))
 
     def policy(self, training: Training) -> Job:
         """Return the job that trains a policy that runs share."""
@@ -347,7 +348,8 @@ class Jobs:
             **self._common(training.dataset),
         }
         inputs = tuple(self._inputs(training.run, training.dataset))
-        return Job("sweep-policy", arguments, inputs, label=(*LABELS, "demos"))
+        labels = (*LABELS, "demos", "scratch")
+        return self._with_scratch(Job("sweep-policy", arguments, inputs, label=labels))
 
     def _actor(self, training: Training) -> Job:
         """Return the job that trains an actor that whole procedures share."""
@@ -466,14 +468,21 @@ class Jobs:
         if run.by_lerobot_train:
             inputs.extend(OPTIONS.get(run.policy, ()))
         else:
-            inputs.append(_recipe_digest(run.policy, run.recipe, run.changes, run.privileged))
+            inputs.append(self._recipe_digest(run))
         return [*inputs, *_other_versions(run)]
+
+    def _recipe_digest(self, run: RunConfig) -> str:
+        """Hash a run's recipe with its changes; read once for all runs that share it."""
+        key = (run.policy, run.recipe, run.changes, run.privileged)
+        if key not in self._recipes:
+            self._recipes[key] = digest(to_identity(policies.recipe_of(run)))
+        return self._recipes[key]
 
 
 LABELS = ("dataset", "accept_licence", "device", "command", "environment")
 """Arguments that change where and how a job is done, but not its result."""
-RUN_LABELS = (*LABELS, "final", "policies", "processes")
-RL_LABELS = (*RUN_LABELS, "demos", "scratch")
+RUN_LABELS = (*LABELS, "final", "policies", "processes", "scratch")
+RL_LABELS = (*RUN_LABELS, "demos")
 LIBRARIES = ("stable_baselines3", "sb3_contrib", "d3rlpy")
 """What a sweep over algorithms imports."""
 
@@ -482,13 +491,6 @@ LIBRARIES = ("stable_baselines3", "sb3_contrib", "d3rlpy")
 def _card_digest(encoder: str) -> str:
     """Hash an encoder's card, which names its weights by their sha256."""
     return digest(to_mapping(encoders.encoder_card(encoder)))
-
-
-@functools.cache
-def _recipe_digest(policy: str, recipe: str, changes: tuple[str, ...], privileged: bool) -> str:
-    """Hash a recipe with its changes; read once for all runs that share it."""
-    run = RunConfig(policy=policy, recipe=recipe, changes=changes, privileged=privileged)
-    return digest(to_identity(policies.recipe_of(run)))
 
 
 def _other_versions(run: RunConfig) -> list[str]:

@@ -17,14 +17,12 @@ from surgicai_vision.demos.store import demos_digest, first_demos
 from surgicai_vision.evaluation.hierarchical_config import HLP, ORDER, HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import PolicySpec, hierarchical_policy, open_policy
 from surgicai_vision.evaluation.storage import RESULT_FILE
-from surgicai_vision.experiments.sweep.jobs import Table, evaluate_as
+from surgicai_vision.experiments.sweep.jobs import POLICY, Table, evaluate_as
 from surgicai_vision.rl.high_level import train_high_level
 from surgicai_vision.rl.high_level_config import HighLevelRequest
 from surgicai_vision.rl.settings import Request, settings_of
 from surgicai_vision.rl.train import train
 from surgicai_vision.training.run_config import RunConfig
-
-POLICY = "policy"
 
 
 def train_actor(
