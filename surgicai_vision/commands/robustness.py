@@ -28,7 +28,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.banks import bank_of
-from surgicai_vision.evaluation.robustness import AXES, CURVES, MARK, STRENGTHS
+from surgicai_vision.evaluation.robustness import CURVES, MARK, SHIFTS, STRENGTHS
 from surgicai_vision.features.encoders import WeightsSource
 
 app = App(
@@ -47,7 +47,7 @@ class Options:
 
     Attributes:
         task: The task.
-        axis: Axes to shift, each alone.
+        axis: Axes to shift, each alone; all shifts every axis at once, all-but-noise all but one.
         strength: Strengths of the shift, from 0 (none) to 1, increasing.
         episodes: Number of episodes at each strength.
         seed: Seed of the first start; each episode takes the next.
@@ -61,7 +61,7 @@ class Options:
     axis: Annotated[
         tuple[str, ...],
         UNIQUE,
-        Parameter(choices=AXES, metavar="AXIS[,AXIS]"),
+        Parameter(choices=SHIFTS, metavar="AXIS[,AXIS]"),
         default_text("all that change what the policy sees or does"),
     ] = ()
     strength: Annotated[tuple[float, ...], LIST, Parameter(metavar="NUMBER[,NUMBER]")] = STRENGTHS

@@ -9,7 +9,7 @@ from surgicai_vision.core.banks import BANKS
 from surgicai_vision.core.config import JSON, TaskConfig, to_mapping
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.evaluation.hierarchical_config import HLP
-from surgicai_vision.evaluation.robustness.axes import AXES
+from surgicai_vision.evaluation.robustness.axes import SHIFTS
 from surgicai_vision.experiments.dataset_config import (
     MOST_EPISODES,
     SEEDS_EACH,
@@ -229,7 +229,7 @@ def _check_condition(plan: "Plan", condition: Condition) -> None:
                     "leave aimed out."
                 )
     if condition.shift is not None:
-        check_name("axis", condition.shift.axis, AXES)
+        check_name("axis", condition.shift.axis, SHIFTS)
         if not 0 <= condition.shift.strength <= 1:
             raise InputError(
                 f"condition {condition.name}: strength is {condition.shift.strength}; "

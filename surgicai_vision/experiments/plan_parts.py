@@ -65,7 +65,7 @@ class Condition:
         upset: let one thing go wrong in every episode (`envs.upset`).
         seed: training seeds that are evaluated in it; all by default.
         episodes: number of starts; the plan's by default.
-        shift: an axis of robustness (`evaluation.robustness.AXES`) and its strength, 0 to 1.
+        shift: an axis of robustness (`evaluation.robustness.SHIFTS`) and its strength, 0 to 1.
         aimed: cut crops where the released detector sees the jaws (`evaluation.aimed_agent`).
     """
 

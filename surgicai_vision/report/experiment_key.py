@@ -9,7 +9,7 @@ from surgicai_vision.core.banks import HELD_OUT
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig, read_changes, world_text
 from surgicai_vision.core.tasks import task_names
-from surgicai_vision.evaluation.robustness.axes import AXES, shifted_config
+from surgicai_vision.evaluation.robustness.axes import SHIFTS, shifted_config
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.training.run_config import BUDGET, RunConfig, Shift
 
@@ -280,7 +280,7 @@ def _unshifted(run: RunConfig, shift: Shift) -> TaskConfig:
     What a shift was added to is not known where both together exceeded a limit.
     """
     env = run.env
-    axis = AXES.get(shift.axis)
+    axis = SHIFTS.get(shift.axis)
     if axis is None:
         return env
     if run.recorded_in:

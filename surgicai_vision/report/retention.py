@@ -17,7 +17,7 @@ from surgicai_vision.core import percentages
 from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation import statistics
-from surgicai_vision.evaluation.robustness import ALL
+from surgicai_vision.evaluation.robustness import SINGLE
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Bar
 from surgicai_vision.report.curves import Chart, evaluated, with_zero
@@ -114,7 +114,6 @@ def _chart(task: str, label: str, rows: list[Kept]) -> Chart:
     bars = [
         Bar(row.axis.replace("_", " "), row.area or 0.0, _last(row), _words(row)) for row in rows
     ]
-    worst = next((row for row in rows if row.axis != ALL and row.area is not None), None)
     title = f"{task}: {label}"
     return Chart(
         title,
@@ -122,10 +121,19 @@ def _chart(task: str, label: str, rows: list[Kept]) -> Chart:
         Markup(""),
         ("axis", "area under retention", "plain", "at strength", "shifted", "kept there"),
         tuple(_row(row) for row in rows),
-        f"Worst single axis: {worst.axis.replace('_', ' ')}, {_share(worst.area)} kept on average."
-        if worst
-        else "There is no plain success of which a share could be kept.",
+        _remark(rows),
     )
+
+
+def _remark(rows: Sequence[Kept]) -> str:
+    """Name the worst single axis of the rows, the worst first."""
+    if all(row.area is None for row in rows):
+        return "There is no plain success of which a share could be kept."
+    for row in rows:
+        if row.axis in SINGLE and row.area is not None:
+            axis = row.axis.replace("_", " ")
+            return f"Worst single axis: {axis}, {_share(row.area)} kept on average."
+    return ""
 
 
 def _last(row: Kept) -> tuple[float, float, float] | None:

@@ -66,7 +66,7 @@ class Shift:
     """What differs from the training conditions in an evaluation of robustness.
 
     Attributes:
-        axis: a key of `robustness.AXES`.
+        axis: a key of `robustness.SHIFTS`.
         strength: 0 to 1.
     """
 

@@ -2,7 +2,7 @@
 
 import json
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +18,16 @@ from surgicai_vision.envs.randomisation import LOOKS
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
-from surgicai_vision.evaluation.robustness import ALL, AXES, CURVES, axes_of, curves, shifted
+from surgicai_vision.evaluation.robustness import (
+    ALL,
+    AXES,
+    CURVES,
+    SHIFTS,
+    SINGLE,
+    axes_of,
+    curves,
+    shifted,
+)
 from surgicai_vision.evaluation.robustness.corrupted_agent import CorruptedAgent
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.statistics import clopper_pearson, mcnemar
@@ -360,12 +369,29 @@ def test_curves_of_what_was_made_anew_are_not_taken_for_its_own(tmp_path, preten
     assert len(pretend.calls) == 1
 
 
+@pytest.mark.parametrize("left_out", SINGLE)
+def test_an_ablation_shifts_everything_but_one_axis(left_out):
+    everything, rest, one = (
+        shifted(seeing_spec(), name, 0.5).config.randomisation
+        for name in (ALL, f"{ALL}-but-{left_out}", left_out)
+    )
+    for axis in fields(everything):
+        was, now = getattr(everything, axis.name), getattr(rest, axis.name)
+        left_as_it_is = getattr(RandomisationConfig(), axis.name)
+        assert now == (left_as_it_is if axis.name in one.on else was)
+    images = SHIFTS[f"{ALL}-but-{left_out}"].images
+    assert images == tuple(kind for kind in AXES[ALL].images if kind not in SINGLE[left_out].images)
+
+
 def test_without_images_only_the_arm_can_shift(tmp_path):
     blind = open_policy("expert", env={"max_steps": 4})
     assert axes_of(blind) == ("latency", "kinematic_error", "needle", "robot_start", ALL)
     assert axes_of(seeing_spec()) == tuple(AXES)
     with pytest.raises(InputError, match="sees no images"):
         curves.robustness(blind, SEEDS, tmp_path, silent, ("blur",))
+    asked = ("all-but-latency",)
+    rows = curves.robustness(blind, SEEDS[:1], tmp_path, silent, asked, (0.0, 1.0))
+    assert [(row["axis"], row["strength"]) for row in rows] == [(asked[0], 0.0), (asked[0], 1.0)]
 
 
 def test_wrong_axes_and_strengths_are_refused(tmp_path):

@@ -1,9 +1,10 @@
 """Axes: what can shift, and how far strength 1 goes. A new axis is one entry of `AXES`.
 
 An axis changes the world, by the randomisation the env already has (`config.RandomisationConfig`),
-or only the images the agent is given (`core.corruption`); `all` applies every axis at once. In the
-world, every episode draws its own shift from its seed, uniform in ± the axis's size; the strength
-scales the size. The shift is added to the task's own randomisation of the axis.
+or only the images the agent is given (`core.corruption`); `all` applies every axis at once, and
+`all-but-noise`, an ablation of it, every axis but the noise. In the world, every episode draws its
+own shift from its seed, uniform in ± the axis's size; the strength scales the size. The shift is
+added to the task's own randomisation of the axis.
 
 At strength 1 a person can only just recognise the scene; `surgicai-vision scene --axes FILE` draws
 every axis at every strength.
@@ -11,7 +12,7 @@ every axis at every strength.
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -47,7 +48,7 @@ class Axis:
 
 ALL = "all"
 """The axis along which everything shifts at once, each by the same strength."""
-_SINGLE: Mapping[str, Axis] = MappingProxyType(
+SINGLE: Mapping[str, Axis] = MappingProxyType(
     {
         "camera": Axis(
             "cameras off by ±10 mm and ±10° about each axis",
@@ -91,18 +92,34 @@ _SINGLE: Mapping[str, Axis] = MappingProxyType(
         ),
     }
 )
+"""The thirteen axes that shift one thing each."""
+
+
+def _together(text: str, names: Collection[str]) -> Axis:
+    """Return the axis along which several axes shift at once."""
+    parts = [SINGLE[name] for name in SINGLE if name in names]
+    return Axis(
+        text,
+        {name: size for part in parts for name, size in part.world.items()},
+        tuple(kind for part in parts for kind in part.images),
+        seen=False,
+    )
+
+
 AXES: Mapping[str, Axis] = MappingProxyType(
-    {
-        **_SINGLE,
-        ALL: Axis(
-            "everything above at once, each at this strength",
-            {name: size for axis in _SINGLE.values() for name, size in axis.world.items()},
-            tuple(kind for axis in _SINGLE.values() for kind in axis.images),
-            seen=False,
-        ),
-    }
+    {**SINGLE, ALL: _together("everything above at once, each at this strength", SINGLE)}
 )
 """Axis → what strength 1 means."""
+SHIFTS: Mapping[str, Axis] = MappingProxyType(
+    {
+        **AXES,
+        **{
+            f"{ALL}-but-{name}": _together(f"everything at once but {name}", SINGLE.keys() - {name})
+            for name in SINGLE
+        },
+    }
+)
+"""The axes, and the ablations of `ALL`: which axis costs most where everything shifts."""
 
 
 def axes_of(spec: "PolicySpec") -> tuple[str, ...]:
@@ -116,16 +133,16 @@ def shifted(spec: "PolicySpec", axis: str, strength: float) -> "PolicySpec":
 
     Args:
         spec: what is evaluated in which task.
-        axis: a key of `AXES`.
+        axis: a key of `SHIFTS`.
         strength: 0 (nothing shifts) to 1.
 
     Raises:
         UnknownName, InputError: no such axis, or a strength out of its range.
     """
-    check_name("axis", axis, AXES)
+    check_name("axis", axis, SHIFTS)
     if not 0 <= strength <= 1:
         raise InputError(f"strength is {strength}; allowed: 0 to 1.")
-    chosen = AXES[axis]
+    chosen = SHIFTS[axis]
     make = spec.make
     if spec.run.views:
         # The outermost agent, made last, sees the image first.

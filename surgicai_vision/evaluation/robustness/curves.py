@@ -1,11 +1,11 @@
 """Curves: successes of a policy against how far one thing shifts from its training conditions.
 
-`robustness(spec, seeds, out)` evaluates every axis of `axes.AXES` at every strength, one
-evaluation folder each (`<out>/<axis>/<strength>/`). It writes `robustness.parquet`: one row for
-every axis and strength with its successes, interval, retention (the share of the plain successes
-that is left, on the same starts) and the axis's area under the curve. All strengths use the same
-starts, and an episode's shift keeps its direction and grows with the strength, so strengths are
-paired. Strength 0 is the plain evaluation.
+`robustness(spec, seeds, out)` evaluates every axis of `axes.AXES`, or those asked for, at every
+strength, one evaluation folder each (`<out>/<axis>/<strength>/`). It writes `robustness.parquet`:
+one row for every axis and strength with its successes, interval, retention (the share of the plain
+successes that is left, on the same starts) and the axis's area under the curve. All strengths use
+the same starts, and an episode's shift keeps its direction and grows with the strength, so
+strengths are paired. Strength 0 is the plain evaluation.
 """
 
 import itertools
@@ -19,7 +19,7 @@ from surgicai_vision.core.progress import Stage
 from surgicai_vision.envs import check_world
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.robustness import CURVES, MARK, STRENGTHS
-from surgicai_vision.evaluation.robustness.axes import AXES, axes_of, shifted
+from surgicai_vision.evaluation.robustness.axes import AXES, SHIFTS, axes_of, shifted
 from surgicai_vision.evaluation.rollout import check_seeds
 from surgicai_vision.evaluation.run import check_scene, evaluate_into
 from surgicai_vision.evaluation.statistics import (
@@ -64,7 +64,8 @@ def robustness(
         seeds: start seeds, the same at every strength.
         out: folder to make or to continue.
         stage: shows progress.
-        axes: keys of `AXES`; empty takes all that change what the policy sees or does (`axes_of`).
+        axes: keys of `SHIFTS`; empty takes the `AXES` that change what the policy sees or does
+            (`axes_of`).
         strengths: each from 0 to 1, increasing.
         workers: processes.
 
@@ -78,12 +79,12 @@ def robustness(
     chosen = _checked(spec, axes, strengths)
     check_seeds(seeds)
     for axis in chosen:
-        if AXES[axis].world and not (out / axis / f"{strengths[-1]:g}" / MARKER).exists():
+        if SHIFTS[axis].world and not (out / axis / f"{strengths[-1]:g}" / MARKER).exists():
             farthest = shifted(spec, axis, strengths[-1]).config
             check_world(farthest, f"axis {axis} at strength {strengths[-1]:g}")
     _claim(out, spec, seeds)
     check_scene(out, spec.config.scene, "curves")
-    places = [out / axis / f"{0.0:g}" for axis in AXES]
+    places = [out / axis / f"{0.0:g}" for axis in SHIFTS]
     plain = next((place for place in places if (place / MARKER).exists()), None)
     for axis in chosen:
         for strength in strengths:
@@ -98,7 +99,7 @@ def robustness(
                             folder, shifted(spec, axis, strength), seeds, workers, progress
                         )
     rows: list[Row] = []
-    for axis in dict.fromkeys((*chosen, *AXES)):
+    for axis in dict.fromkeys((*chosen, *SHIFTS)):
         stored = _stored(out / axis)
         if stored:
             rows += _curve(axis, list(stored), list(stored.values()))
@@ -121,8 +122,8 @@ def _checked(spec: PolicySpec, axes: Sequence[str], strengths: Sequence[float]) 
     """Return the axes to evaluate; refuse axes or strengths that cannot be."""
     possible = axes_of(spec)
     for axis in axes:
-        check_name("axis", axis, AXES)
-        if axis not in possible:
+        check_name("axis", axis, SHIFTS)
+        if axis in AXES and axis not in possible:
             raise InputError(
                 f"{spec.name} sees no images, so '{axis}' changes nothing; "
                 f"allowed: {_list(possible)}."

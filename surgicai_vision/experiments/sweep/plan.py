@@ -19,7 +19,7 @@ from surgicai_vision.core.tasks import TASKS
 from surgicai_vision.demos.store import demos_digest, list_demos
 from surgicai_vision.envs import check_world
 from surgicai_vision.envs.upset import check_upset_task
-from surgicai_vision.evaluation.robustness.axes import AXES, shifted_config
+from surgicai_vision.evaluation.robustness.axes import SHIFTS, shifted_config
 from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_versioned
 from surgicai_vision.experiments.plan_config import plan_of
 from surgicai_vision.experiments.prepare import check_dataset, demos_folders
@@ -199,7 +199,7 @@ def _check_worlds(experiment: Experiment, run: RunConfig) -> None:
         check_world(env, f"demonstrations {training.dataset}")
     env = run.env
     if run.shift:
-        env = shifted_config(env, AXES[run.shift.axis], run.shift.strength)
+        env = shifted_config(env, SHIFTS[run.shift.axis], run.shift.strength)
     check_world(env, f"condition {run.condition}" if run.condition else f"task {run.task}")
 
 
