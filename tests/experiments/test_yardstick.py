@@ -26,7 +26,7 @@ def yardstick() -> Plan:
 
 def test_every_task_has_every_policy_clean_and_shifted(yardstick: Plan) -> None:
     can_run = [run for run in yardstick.runs if not yardstick.needs(run)]
-    assert len(can_run) == len(names.SUBTASKS) * (3 + 3) * 2
+    assert len(can_run) == len(names.SUBTASKS) * (3 + 3) * 2 * 2, "two conditions, two seeds"
     assert len({run.starts for run in can_run}) == 1 and can_run[0].starts.episodes == 100
     for task in names.SUBTASKS:
         of_task = [run for run in can_run if run.task == task]
