@@ -55,9 +55,6 @@ class ChunkRecipe(Recipe):
             oldest; None executes only the newest.
         measure_delay: measure how late actions take effect, and execute of each plan the action
             that is due by then (`evaluation.delay`); needs a chunk longer than the delay.
-        until_disturbed: a learned chunk ends where something else than the demonstrator's answer
-            was executed (noise, a miss, a learner): its next answers correct what came of that,
-            and are not what it would have gone on with.
         ema: largest decay of the moving average of the weights; 0 keeps the last weights.
         clip_gradient: gradient norm limit; 0 disables clipping.
         minutes: train for as many epochs as fit into this many minutes of one core, instead of
@@ -76,7 +73,6 @@ class ChunkRecipe(Recipe):
     minutes: float = 0.0
     settings: dict[str, JSON] = field(default_factory=dict)
     measure_delay: bool = field(default=False, metadata=LATER)
-    until_disturbed: bool = field(default=False, metadata=LATER)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -79,9 +79,7 @@ def train_run(
     trains_on = CPU if device is None else encodes_on
     dataset = with_frame_stride(dataset, recipe.frame_stride)
     # Missing demonstrations are found before anything is encoded.
-    timeline = None
-    if plugin.offsets is not None:
-        timeline = timeline_of(dataset, demos, executed=_ends_at_disturbance(recipe))
+    timeline = timeline_of(dataset, demos) if plugin.offsets is not None else None
     progress_policy = policies.load_policy(progress_from) if progress_from else None
     if progress_policy is not None:
         check_progress_policy(progress_policy.checkpoint, dataset)
@@ -180,19 +178,11 @@ def _selections(
     """
     if plugin.offsets is not None and timeline is not None:
         offsets = plugin.offsets(recipe)
-        until_disturbed = _ends_at_disturbance(recipe)
-        yield lambda present: with_chunks(
-            present, timeline, offsets, until_disturbed=until_disturbed
-        )
+        yield lambda present: with_chunks(present, timeline, offsets)
     if run.demonstrations not in (None, len(np.unique(dataset.demonstration_index))):
         yield functools.partial(first_episodes, count=run.demonstrations)
     if subtask is not None:
         yield functools.partial(of_subtask, subtask=subtask)
-
-
-def _ends_at_disturbance(recipe: Recipe) -> bool:
-    """Return True if a learned chunk ends where its demonstration was disturbed."""
-    return isinstance(recipe, ChunkRecipe) and recipe.until_disturbed
 
 
 def _within_budget(

@@ -6,9 +6,7 @@
 
 The last of the eight values is 1 where the demonstration has no such step; the action of its
 nearest step is repeated there, as in LeRobot's `action_is_pad`. A chunk ends with its episode and,
-in a whole procedure, with its subtask, after which another arm acts. With `until_disturbed` it also
-ends with the first step at which something else than the demonstrator's action was executed: the
-actions after it are answers to what that did.
+in a whole procedure, with its subtask, after which another arm acts.
 
 Frames may be sparse, but actions are those of every control step. A dataset rendered with
 `--frame-stride` holds only its frames' actions. The rest is read from its demonstrations, which
@@ -42,56 +40,42 @@ class Timeline:
         first: (M,) first step of each step's run (one subtask of one demonstration).
         last: (M,) last step of that run.
         step: (L,) the step of each frame of the dataset as it was rendered.
-        disturbed: (M,) whether something else than `action` was executed; None where that was not
-            read.
     """
 
     action: NDArray[np.float32]
     first: NDArray[np.int64]
     last: NDArray[np.int64]
     step: NDArray[np.int64]
-    disturbed: NDArray[np.bool_] | None = None
 
 
-def timeline_of(
-    dataset: Dataset, demos: Sequence[Path] = (), *, executed: bool = False
-) -> Timeline:
+def timeline_of(dataset: Dataset, demos: Sequence[Path] = ()) -> Timeline:
     """Return the timeline of a dataset, or of the whole dataset that it was selected from.
 
     Args:
         dataset: any dataset.
         demos: the folders of its demonstrations, in the order in which they were rendered, for one
             that was rendered with fewer frames; by default the folder next to it, as in a sweep.
-        executed: read what was executed too, which the demonstrations alone hold.
 
     Raises:
-        InputError: the demonstrations are needed, and are missing or different ones.
+        InputError: frames were left out, and the demonstrations are missing or different ones.
     """
     root = whole_of(dataset)
-    if root.fps == root.config.steps_per_second and not executed:
+    if root.fps == root.config.steps_per_second:
         columns = root.columns()
         phase = columns.get(names.PHASE)
         index = np.asarray(root.episode_index)
         runs = _runs(index, np.zeros(len(index)) if phase is None else np.asarray(phase))
         action = np.asarray(columns[names.ACTION], np.float32)
         return Timeline(action, *runs, np.arange(root.length))
+    return _from_demos(root, demos or [root.path.parent / BESIDE])
+
+
+def _from_demos(dataset: Dataset, folders: Sequence[Path]) -> Timeline:
+    """Return the timeline of a dataset whose demonstrations lie in `folders`."""
     need = (
-        f"{root.path} does not hold what was executed, by which until_disturbed ends a chunk"
-        if executed
-        else f"{root.path} holds {root.fps} frames per second, and a policy that plans chunks "
-        f"learns from the action of every step, {root.config.steps_per_second} per second"
+        f"{dataset.path} holds {dataset.fps} frames per second, and a policy that plans chunks "
+        f"learns from the action of every step, {dataset.config.steps_per_second} per second"
     )
-    return _from_demos(root, demos or [root.path.parent / BESIDE], need)
-
-
-def _from_demos(dataset: Dataset, folders: Sequence[Path], need: str) -> Timeline:
-    """Return the timeline of a dataset whose demonstrations lie in `folders`.
-
-    Args:
-        dataset: a dataset as it was rendered.
-        folders: its demonstrations, in order.
-        need: what they are needed for, as an error says it.
-    """
     try:
         paths = [path for folder in folders for path in list_demos(folder)]
     except (BadFile, InputError) as error:
@@ -114,44 +98,26 @@ def _from_demos(dataset: Dataset, folders: Sequence[Path], need: str) -> Timelin
     control_steps = np.rint(seconds * names.FPS).astype(np.int64)
     within = control_steps // dataset.config.action_repeat
     step = begins[np.asarray(dataset.demonstration_index)] + within
-    action = np.concatenate([demo.action for demo in shown])
-    executed = np.concatenate(
-        [demo.action if demo.executed is None else demo.executed for demo in shown]
-    )
-    return Timeline(action, *runs, step, (executed != action).any(axis=1))
+    return Timeline(np.concatenate([demo.action for demo in shown]), *runs, step)
 
 
-def with_chunks(
-    dataset: Dataset,
-    timeline: Timeline,
-    offsets: Sequence[int],
-    *,
-    until_disturbed: bool = False,
-) -> DatasetSubset:
+def with_chunks(dataset: Dataset, timeline: Timeline, offsets: Sequence[int]) -> DatasetSubset:
     """Return a dataset with the column `names.ACTION_CHUNK`, (N, T, 8) float32.
 
     Args:
         dataset: any frames of the dataset that `timeline` belongs to.
         timeline: from `timeline_of`.
         offsets: (T,) offsets of a chunk's actions, in control steps from the present one.
-        until_disturbed: end a chunk with the first disturbed step from the present one on; needs a
-            timeline that was read with `executed`.
     """
     present = timeline.step[rows_in_whole(dataset)]
     wanted = present[:, None] + np.asarray(offsets, np.int64)
     held = np.clip(wanted, timeline.first[present, None], timeline.last[present, None])
-    is_pad = wanted != held
-    described = " ".join(map(str, offsets))
-    if until_disturbed:
-        assert timeline.disturbed is not None, "the timeline was read with `executed`"
-        before = np.concatenate([[0], np.cumsum(timeline.disturbed)])
-        is_pad |= before[np.maximum(held, present[:, None])] > before[present, None]
-        described += " until disturbed"
-    chunks = np.concatenate([timeline.action[held], is_pad[..., None].astype(np.float32)], axis=2)
+    is_pad = (wanted != held).astype(np.float32)
+    chunks = np.concatenate([timeline.action[held], is_pad[..., None]], axis=2)
     return DatasetSubset(
         dataset,
         np.arange(dataset.length),
-        {"chunks": described},
+        {"chunks": " ".join(map(str, offsets))},
         added={names.ACTION_CHUNK: chunks},
     )
 

@@ -28,9 +28,7 @@ from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.dataset import open_dataset, render_demos
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.subset import of_subtask, with_frame_stride
-from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.demos.record import record
-from surgicai_vision.demos.store import list_demos, read_demo
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.chunk_agent import ChunkAgent
 from surgicai_vision.evaluation.policy_spec import open_policy
@@ -160,36 +158,6 @@ def test_a_dataset_of_few_frames_has_its_actions_in_its_demonstrations(tmp_path:
     for wrong in (both[:1], both[::-1]):
         with pytest.raises(InputError, match="in the order in which they were rendered"):
             timeline_of(joined, wrong)
-
-
-def test_a_chunk_may_end_where_something_else_was_executed(tmp_path: Path) -> None:
-    context = RunContext(0)
-    misses = Disturbance(aim_noise=1.5)
-    out = tmp_path / "demos"
-    record(TaskConfig("insert"), episodes=1, out=out, disturbance=misses, context=context)
-    render_demos(tmp_path / "demos", tmp_path / "set", views=("back",), size=16, context=context)
-    dataset = open_dataset(tmp_path / "set")
-    (path,) = list_demos(tmp_path / "demos")
-    demo = read_demo(path)
-    assert demo.executed is not None
-    is_disturbed = (demo.executed != demo.action).any(axis=1)
-    assert 0 < is_disturbed.sum() < len(demo), "some of its attempts aim right"
-
-    offsets = range(-1, 4)
-    timeline = timeline_of(dataset, executed=True)
-    plain = with_chunks(dataset, timeline, offsets).columns()[names.ACTION_CHUNK]
-    column = with_chunks(dataset, timeline, offsets, until_disturbed=True)
-    chunks = column.columns()[names.ACTION_CHUNK]
-    np.testing.assert_array_equal(chunks[..., :ACTIONS], plain[..., :ACTIONS])
-    for step in range(len(demo)):
-        for place, offset in enumerate(offsets):
-            outside = not 0 <= step + offset < len(demo)
-            gone_astray = is_disturbed[step : step + offset].any() if offset > 0 else False
-            assert chunks[step, place, ACTIONS] == (outside or gone_astray)
-    fingerprint = with_chunks(dataset, timeline, offsets).fingerprint
-    assert column.fingerprint != fingerprint
-    with pytest.raises(InputError, match="does not hold what was executed"):
-        timeline_of(dataset, [tmp_path / "nowhere"], executed=True)
 
 
 def test_a_dataset_of_held_actions_has_each_of_them_once(tmp_path: Path) -> None:
