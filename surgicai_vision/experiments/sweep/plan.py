@@ -348,8 +348,8 @@ class Jobs:
             **self._common(training.dataset),
         }
         inputs = tuple(self._inputs(training.run, training.dataset))
-        labels = (*LABELS, "demos", "scratch")
-        return self._with_scratch(Job("sweep-policy", arguments, inputs, label=labels))
+        label = (*LABELS, "demos")
+        return self._with_scratch(Job("sweep-policy", arguments, inputs, label=label))
 
     def _actor(self, training: Training) -> Job:
         """Return the job that trains an actor that whole procedures share."""
@@ -393,7 +393,8 @@ class Jobs:
     def _with_scratch(self, job: Job) -> Job:
         """Add the folder in which a killed training continues; no other job uses it."""
         scratch = str((self.out / TRAINING / job.key()).absolute())
-        return replace(job, arguments={**job.arguments, "scratch": scratch})
+        arguments = {**job.arguments, "scratch": scratch}
+        return replace(job, arguments=arguments, label=(*job.label, "scratch"))
 
     def features(self, run: RunConfig) -> list[Job]:
         """Return the jobs that encode what a run sees, view by view, so that runs share them."""
@@ -481,7 +482,7 @@ class Jobs:
 
 LABELS = ("dataset", "accept_licence", "device", "command", "environment")
 """Arguments that change where and how a job is done, but not its result."""
-RUN_LABELS = (*LABELS, "final", "policies", "processes", "scratch")
+RUN_LABELS = (*LABELS, "final", "policies", "processes")
 RL_LABELS = (*RUN_LABELS, "demos")
 LIBRARIES = ("stable_baselines3", "sb3_contrib", "d3rlpy")
 """What a sweep over algorithms imports."""
