@@ -115,6 +115,7 @@ class ChunkPolicy(Policy, abc.ABC):
         recipe: its settings.
         visual: shape of each view's feature.
         normalisation: how actions are normalised, one of `NORMALISATIONS`.
+        sets: how many heads each feature gets, for as many networks side by side.
 
     Attributes:
         chunk, execute, samples, ensemble, measure_delay: as in the recipe.
@@ -126,7 +127,11 @@ class ChunkPolicy(Policy, abc.ABC):
     action_scale: torch.Tensor
 
     def __init__(
-        self, recipe: ChunkRecipe, visual: tuple[tuple[int, ...], ...], normalisation: str
+        self,
+        recipe: ChunkRecipe,
+        visual: tuple[tuple[int, ...], ...],
+        normalisation: str,
+        sets: int = 1,
     ):
         super().__init__(Inputs(visual, fed_vector(recipe)))
         check_name("normalisation", normalisation, NORMALISATIONS)
@@ -139,7 +144,7 @@ class ChunkPolicy(Policy, abc.ABC):
         self.ensemble = recipe.ensemble
         self.measure_delay = recipe.measure_delay
         self.spacing = recipe.frame_stride
-        self.heads = FeatureHeads(recipe, self.inputs)
+        self.heads = FeatureHeads(recipe, self.inputs, sets)
         self._normalisation = normalisation
         self.register_buffer("action_centre", torch.zeros(ACTIONS))
         self.register_buffer("action_scale", torch.ones(ACTIONS))

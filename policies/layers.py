@@ -208,24 +208,33 @@ def _normalised(rows: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
 class _Heads(nn.Module):
     """The head of each feature.
 
+    Args:
+        recipe: its `join_views`, `map_head` and `instance_norm` are used.
+        inputs: the layout of the inputs.
+        sets: how many heads each feature gets, for as many networks side by side.
+
     Attributes:
         inputs: the layout of the inputs.
-        shapes: shape of each feature that has its own head.
+        sets: how many heads each feature has.
+        shapes: shape of each feature that has its own heads.
         dim: length of the heads' output, 0 without images.
         instance_norm: whether the heads see maps after instance normalisation.
     """
 
-    def __init__(self, recipe: Recipe, inputs: Inputs):
+    def __init__(self, recipe: Recipe, inputs: Inputs, sets: int = 1):
         super().__init__()
         self.inputs = inputs
+        self.sets = sets
         self.shapes = visual_shapes(recipe, inputs.visual)
         self.instance_norm = recipe.instance_norm
-        heads = [_head(shape, recipe.map_head) for shape in self.shapes]
+        heads = [_head(shape, recipe.map_head) for _ in range(sets) for shape in self.shapes]
         self.heads = nn.ModuleList(heads)
         self.dim = sum(head.dim for head in heads)
 
     def outputs(self, observed: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
         """Return each head's output, (B, head.dim), and the vector fed with the features, (B, n).
+
+        The outputs of the first set of heads come first.
 
         Args:
             observed: normalised inputs (B, inputs.dim).
@@ -234,7 +243,8 @@ class _Heads(nn.Module):
         *rows, vector = observed.split([*sizes, self.inputs.width], dim=1)
         if self.instance_norm:
             rows = [_normalised(row, of) for row, of in zip(rows, self.shapes, strict=True)]
-        return [head(row) for head, row in zip(self.heads, rows, strict=True)], vector
+        fed = rows * self.sets
+        return [head(row) for head, row in zip(self.heads, fed, strict=True)], vector
 
 
 @final

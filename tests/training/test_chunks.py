@@ -17,7 +17,7 @@ from torch import nn
 
 from policies.base import ACTIONS, Plugin, Recipe
 from policies.bc import BC
-from policies.bc_chunk import BC_CHUNK, BCChunkRecipe
+from policies.bc_chunk import BC_CHUNK, BCChunkPolicy, BCChunkRecipe
 from policies.chunks import ChunkPolicy, ChunkRecipe
 from policies.lerobot import DIFFUSION, VQBET
 from surgicai_vision.core import names
@@ -543,6 +543,73 @@ def test_bc_chunk_learns_every_planned_action_and_no_padding() -> None:
 def test_bc_chunk_refuses_what_its_network_has_not(given: dict[str, object]) -> None:
     with pytest.raises(InputError, match="bc-chunk sees one observation"):
         BCChunkRecipe(**given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("members", [0, 101])
+def test_bc_chunk_has_1_to_100_networks(members: int) -> None:
+    with pytest.raises(InputError, match=f"members is {members}; it must be at"):
+        BCChunkRecipe(members=members)
+
+
+def members_of(count: int) -> BCChunkPolicy:
+    """A `bc-chunk` of `count` networks that see a feature map and the pose."""
+    torch.manual_seed(0)
+    recipe = BCChunkRecipe(hidden=(16,), chunk=3, map_head="keypoints", members=count)
+    policy = BC_CHUNK.make(recipe, ((4, 6, 6),))
+    assert isinstance(policy, BCChunkPolicy)
+    return policy
+
+
+def test_the_plan_of_several_networks_is_the_mean_of_theirs() -> None:
+    several = members_of(3)
+    state = several.state_dict()
+    generator = torch.Generator().manual_seed(1)
+    observed = torch.randn(5, several.inputs.dim, generator=generator)
+    target = torch.rand(5, 3, ACTIONS + 1, generator=generator).round()
+    alone: list[torch.Tensor] = []
+    losses: list[torch.Tensor] = []
+    for member in range(3):
+        layers = "network." if member == 0 else f"others.{member - 1}."
+        heads = f"heads.heads.{member}."
+        renamed = {
+            layers: "network.",
+            heads: "heads.heads.0.",
+            "input_": "input_",
+            "action_": "action_",
+        }
+        own = {
+            key.replace(old, new, 1): value
+            for key, value in state.items()
+            for old, new in renamed.items()
+            if key.startswith(old)
+        }
+        one = members_of(1)
+        one.load_state_dict(own)  # a policy of one network has the names it always had
+        losses.append(one.loss(observed, target))
+        alone.append(one.eval()._chunks(observed))
+    torch.testing.assert_close(several.loss(observed, target), torch.stack(losses).mean())
+    several.eval()
+    mean = torch.stack(alone).mean(0)
+    torch.testing.assert_close(several._chunks(observed), mean)
+    taught = target[..., ACTIONS] == 0
+    error = ((mean - target[..., :ACTIONS])[taught] ** 2).mean()
+    torch.testing.assert_close(several.loss(observed, target), error)
+    assert not torch.allclose(alone[0], alone[1])
+
+
+def test_a_network_learns_from_its_own_errors_alone() -> None:
+    """Its gradient has the direction that it has without the others, whatever they answer."""
+    several = members_of(2)
+    observed = torch.randn(6, several.inputs.dim, generator=torch.Generator().manual_seed(1))
+    target = torch.zeros(6, 3, ACTIONS + 1)
+    first = next(several.network.parameters())
+    second = next(several.others.parameters())
+    (before,) = torch.autograd.grad(several.loss(observed, target), first)
+    with torch.no_grad():
+        second.mul_(10.0)
+    (after,) = torch.autograd.grad(several.loss(observed, target), first)
+    torch.testing.assert_close(after, before)
+    assert before.abs().max() > 0
 
 
 @pytest.mark.parametrize("samples", [1, 3])
