@@ -95,11 +95,12 @@ class BCChunkPolicy(ChunkPolicy):
         networks = [self.network, *self.others]
         fed = vector.flatten(1)
         seen = visual.flatten(1).unflatten(1, (len(networks), self._seen_by_each))
-        answers = [
+        rows = [
             network(torch.cat([seen[:, member], fed], dim=1)).tanh()
             for member, network in enumerate(networks)
         ]
-        return torch.stack(answers).unflatten(2, (self.chunk, ACTIONS))
+        answers: torch.Tensor = torch.stack(rows).unflatten(2, (self.chunk, ACTIONS))
+        return answers
 
 
 def _make(recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> BCChunkPolicy:
