@@ -90,7 +90,9 @@ def evaluate_into(
     with alone_in(out):
         finished = None
         if spec.resumes:
-            owner = [to_mapping(run), dict(spec.about), scene_hash, episode_code(), repr(filming)]
+            # The call that continues an evaluation may have other options.
+            told = {key: value for key, value in spec.about.items() if key != "command"}
+            owner = [to_mapping(run), told, scene_hash, episode_code(), repr(filming)]
             finished = FinishedEpisodes(out / FOLDER, digest(owner))
         episodes = evaluate(
             spec.make_agent,

@@ -202,7 +202,7 @@ def test_a_sweep_trains_counts_and_is_not_done_twice(tmp_path):
     result = run_sweep(grid, out, RunContext(0))
     assert (result["done"], result["failed"]) == (2, 0), result["problems"]
     assert {state.state for state in plan(read_experiment_of(out), out)} == {CACHED}
-    assert not list((out / "training").iterdir())
+    assert not list((out / "unfinished").iterdir())
     for run in grid.runs:
         folder = out / "runs" / run_key(run)
         stored = read_evaluation(folder / "evaluation")

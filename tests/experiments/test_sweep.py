@@ -28,7 +28,8 @@ from surgicai_vision.core.executor.store import LOCK
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.codecs import DEPTH_FAR, DEPTH_NEAR, grey
 from surgicai_vision.dataset.subset import first_episodes, with_frame_stride
-from surgicai_vision.evaluation.storage import FORMAT, GRID_FILE, read_evaluation
+from surgicai_vision.evaluation.finished import FinishedEpisodes
+from surgicai_vision.evaluation.storage import FORMAT, GRID_FILE, OURS, read_evaluation
 from surgicai_vision.experiments.sweep import driver
 from surgicai_vision.experiments.sweep.driver import run_sweep
 from surgicai_vision.experiments.sweep.estimate import estimate
@@ -143,7 +144,36 @@ def test_a_training_that_was_interrupted_continues_in_the_next_call(tmp_path, mo
     again = sweep(grid, out)
     assert epochs[0] == 5 and epochs[-1] == 12, "from the state that the interrupted call left"
     assert again["digest"] == quiet["digest"]
-    assert not list((out / "training").iterdir()), "the state is removed with the result"
+    assert not list((out / "unfinished").iterdir()), "the state is removed with the result"
+
+
+def test_an_evaluation_that_was_interrupted_continues_in_the_next_call(tmp_path, monkeypatch):
+    grid = replace(BLIND, seed=(0,), demonstrations=(2,), episodes=3, expert=False)
+    quiet = sweep(grid, tmp_path / "quiet")
+    out = tmp_path / "out"
+    kept = FinishedEpisodes.keep
+    seeds = []
+
+    def interrupted(self, episode):
+        kept(self, episode)
+        raise KeyboardInterrupt
+
+    def noted(self, episode):
+        kept(self, episode)
+        seeds.append(episode.row.seed)
+
+    monkeypatch.setattr(FinishedEpisodes, "keep", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        sweep(grid, out)
+    assert not list(out.glob("runs/*"))
+    assert len(list(out.glob("unfinished/*/evaluation/finished/*"))) == 1
+    monkeypatch.setattr(FinishedEpisodes, "keep", noted)
+    again = sweep(grid, out)
+    assert len(seeds) == 2, "the third was there"
+    assert again["digest"] == quiet["digest"]
+    (run,) = out.glob("runs/*")
+    assert {path.name for path in (run / "evaluation").iterdir()} <= set(OURS) - {"finished"}
+    assert not list((out / "unfinished").iterdir())
 
 
 def test_a_sweep_of_one_run_shares_its_episodes_among_the_workers(tmp_path, monkeypatch):

@@ -29,7 +29,7 @@ from surgicai_vision.experiments.sweep.plan import (
     PROBE_FILE,
     REFERENCE_FILE,
     TO_DO,
-    TRAINING,
+    UNFINISHED,
     Jobs,
     RunState,
     lacking,
@@ -439,4 +439,4 @@ def _file(folder: Path, place: _Place, key: str) -> None:
     os.rename(folder, place.folder)
     files.sync_folder(place.folder.parent)
     # Filed, so the state from which a killed training would resume is no longer needed.
-    shutil.rmtree(folder.parent.parent / TRAINING / key, ignore_errors=True)
+    shutil.rmtree(folder.parent.parent / UNFINISHED / key, ignore_errors=True)

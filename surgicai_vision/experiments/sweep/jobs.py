@@ -3,9 +3,10 @@
 Encode, train a policy that runs share, do a run, evaluate a reference. Each writes into its own
 folder and reads datasets and cache by path. Nothing here depends on which worker does it.
 
-A training works in `scratch`, a folder that no other job uses, and continues there if a killed
-sweep is run again. Its checkpoint is then copied to the job's own folder. The sweep removes
-`scratch` once the result is filed. A training by `lerobot-train` begins anew.
+A run works in `scratch`, a folder that no other job uses, and continues there if a killed sweep is
+run again: its training from the last state, its evaluation with the episodes that are missing. What
+they make is then copied to the job's own folder. The sweep removes `scratch` once the result is
+filed. A training by `lerobot-train` begins anew.
 """
 
 import dataclasses
@@ -34,6 +35,7 @@ from surgicai_vision.evaluation.robustness.axes import shifted
 from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.evaluation.storage import RESULT_FILE
 from surgicai_vision.experiments.run import encode_run, train_run
+from surgicai_vision.experiments.sweep.collect import EVALUATION
 from surgicai_vision.experiments.sweep.lerobot import SCRATCH, train_lerobot
 from surgicai_vision.experiments.sweep.plan import PROBE_FILE, REFERENCE_FILE
 from surgicai_vision.features.devices import AUTO
@@ -44,7 +46,7 @@ from surgicai_vision.training.run_config import RunConfig, evaluated_in
 type Table = Mapping[str, JSON]
 
 POLICY = "policy"
-"""Folder of a checkpoint within a run's, and within the folder in which a training works."""
+"""Folder of a checkpoint within a run's, and within the folder in which a run works."""
 
 
 def encode_features(
@@ -139,7 +141,8 @@ def train_and_evaluate(
         spec = _shifted(spec, what)
         about = {**spec.about, **about}
         with measured("evaluation", "steps"):
-            summary = evaluate_as(folder / "evaluation", spec, what, about, processes)
+            summary = evaluate_as(Path(scratch) / EVALUATION, spec, what, about, processes)
+    shutil.copytree(Path(scratch) / EVALUATION, folder / EVALUATION)
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)
     write_json(folder / RESULT_FILE, {"run": run, "summary": summary, "seconds": seconds})
 

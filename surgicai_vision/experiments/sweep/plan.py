@@ -38,8 +38,8 @@ from surgicai_vision.training.run_config import OWN, RunConfig
 
 REFERENCE_FILE = "reference.json"
 PROBE_FILE = "probe.json"
-TRAINING = "training"
-"""Folder of a sweep in which trainings work, one folder per job."""
+UNFINISHED = "unfinished"
+"""Folder of a sweep in which runs and trainings work, one folder per job."""
 TO_DO: Final = "to do"
 CACHED: Final = "cached"
 NOT_RUN: Final = "not run"
@@ -391,8 +391,8 @@ class Jobs:
         return tuple(self.dataset_digest(name) or "" for name in self.datasets_of(run))
 
     def _with_scratch(self, job: Job) -> Job:
-        """Add the folder in which a killed training continues; no other job uses it."""
-        scratch = str((self.out / TRAINING / job.key()).absolute())
+        """Add the folder in which a killed job continues; no other job uses it."""
+        scratch = str((self.out / UNFINISHED / job.key()).absolute())
         arguments = {**job.arguments, "scratch": scratch}
         return replace(job, arguments=arguments, label=(*job.label, "scratch"))
 
