@@ -438,5 +438,5 @@ def _file(folder: Path, place: _Place, key: str) -> None:
     shutil.rmtree(place.folder, ignore_errors=True)
     os.rename(folder, place.folder)
     files.sync_folder(place.folder.parent)
-    # Filed, so the state from which a killed training would resume is no longer needed.
+    # Filed, so what a killed job would continue from is no longer needed.
     shutil.rmtree(folder.parent.parent / UNFINISHED / key, ignore_errors=True)

@@ -141,8 +141,7 @@ def train_and_evaluate(
         spec = _shifted(spec, what)
         about = {**spec.about, **about}
         with measured("evaluation", "steps"):
-            summary = evaluate_as(Path(scratch) / EVALUATION, spec, what, about, processes)
-    shutil.copytree(Path(scratch) / EVALUATION, folder / EVALUATION)
+            summary = evaluate_run(folder, Path(scratch), spec, what, about, processes)
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)
     write_json(folder / RESULT_FILE, {"run": run, "summary": summary, "seconds": seconds})
 
@@ -201,6 +200,15 @@ def _train(
     else:
         train_run(run, dataset, scratch / POLICY, stage, weights, device=device)
         shutil.copytree(scratch / POLICY, policy)
+
+
+def evaluate_run(
+    folder: Path, scratch: Path, spec: PolicySpec, run: RunConfig, about: Table, processes: int
+) -> dict[str, JSON]:
+    """Evaluate a run in `scratch`, or continue there, and copy the evaluation into its folder."""
+    summary = evaluate_as(scratch / EVALUATION, spec, run, about, processes)
+    shutil.copytree(scratch / EVALUATION, folder / EVALUATION)
+    return summary
 
 
 def evaluate_as(

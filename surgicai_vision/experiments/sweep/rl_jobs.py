@@ -1,8 +1,8 @@
 """Jobs of a sweep over algorithms, as workers do them; see `rl_grid`.
 
-A training works in `scratch`, a folder that no other job uses, and continues there if a killed
-sweep is run again. Its checkpoint and curve are then copied to the job's own folder. The sweep
-removes `scratch` once the result is filed.
+A training and an evaluation work in `scratch`, a folder that no other job uses, and continue there
+if a killed sweep is run again. Checkpoint, curve and evaluation are then copied to the job's own
+folder. The sweep removes `scratch` once the result is filed.
 """
 
 import os
@@ -17,7 +17,7 @@ from surgicai_vision.demos.store import demos_digest, first_demos
 from surgicai_vision.evaluation.hierarchical_config import HLP, ORDER, HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import PolicySpec, hierarchical_policy, open_policy
 from surgicai_vision.evaluation.storage import RESULT_FILE
-from surgicai_vision.experiments.sweep.jobs import POLICY, Table, evaluate_as
+from surgicai_vision.experiments.sweep.jobs import POLICY, Table, evaluate_run
 from surgicai_vision.rl.high_level import train_high_level
 from surgicai_vision.rl.high_level_config import HighLevelRequest
 from surgicai_vision.rl.settings import Request, settings_of
@@ -81,7 +81,7 @@ def train_and_evaluate(
             kept["hierarchical"] = {**policies, HLP: place, "termination": what.termination}
         with measured("evaluation", "steps"):
             about = {**spec.about, **kept}
-            summary = evaluate_as(folder / "evaluation", spec, what, about, processes)
+            summary = evaluate_run(folder, Path(scratch), spec, what, about, processes)
     write_json(folder / RESULT_FILE, {"run": run, "summary": summary, "seconds": seconds})
 
 
