@@ -61,6 +61,8 @@ VECTORS: Mapping[str, int] = MappingProxyType(
 """Inputs that may be fed alongside the features: key → length."""
 MOST_EPOCHS = 1_000_000
 """Maximum number of passes over the training frames."""
+MOST_AVERAGED = 1_000
+"""Maximum number of images that are averaged: a whole procedure."""
 FARTHEST_SHIFT = 1_024
 """Maximum shift of a feature map [places]; no map is wider."""
 
@@ -106,6 +108,9 @@ class Recipe:
         speed: share of each action that is executed, above 0 and at most 1; the clock runs as much
             slower. It does not affect what is learned (docs/evaluation.md); see `Pace`.
         jaw_speed, clock_speed: see `Pace`; they do not affect what is learned either.
+        denoise: most successive images that are averaged wherever they stand still, when the policy
+            acts (`evaluation.denoised_agent`); 1 leaves images as they are. It does not affect what
+            is learned.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -131,13 +136,15 @@ class Recipe:
     speed: float = field(default=1.0, metadata=LATER)
     jaw_speed: float = field(default=1.0, metadata=LATER)
     clock_speed: float = field(default=1.0, metadata=LATER)
+    denoise: int = field(default=1, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_finite(**{key: of for key, of in vars(self).items() if isinstance(of, float)})
         check_name("split", self.split, ("episode", "transition"))
         check_name("schedule", self.schedule, ("constant", "one_cycle"))
         check_name("map_head", self.map_head, ("softmax", "convolutions", "keypoints"))
-        check_at_least(1, frame_stride=self.frame_stride)
+        check_at_least(1, frame_stride=self.frame_stride, denoise=self.denoise)
+        check_at_most(MOST_AVERAGED, denoise=self.denoise)
         check_hidden(self.hidden)
         check_at_most(MOST_EPOCHS, epochs=self.epochs)
         check_at_most(FARTHEST_SHIFT, map_shift=self.map_shift)
@@ -296,6 +303,7 @@ class Policy(nn.Module, abc.ABC):
         input_std: standard deviation of each, 1 where an input is constant.
         checkpoint: the checkpoint that a loaded policy was restored from.
         pace: how fast it acts, as its recipe has it.
+        denoise: how many images it is shown the mean of, as its recipe has it.
         history: number of observations it sees, the present one last.
         averaging: largest decay of the moving average of its weights in training; the average is
             what is kept. 0 keeps the weights themselves.
@@ -303,6 +311,7 @@ class Policy(nn.Module, abc.ABC):
     """
 
     pace: Pace = FULL_SPEED
+    denoise: int = 1
     history: int = 1
     averaging: float = 0.0
     clip: float = 0.0

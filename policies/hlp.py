@@ -52,8 +52,8 @@ class HLPRecipe(Recipe):
         for name in ("privileged", "setpoint", "progress_input"):
             if getattr(self, name):
                 raise InputError(f"Policy 'hlp' sees both arms and images; leave '{name}' off.")
-        for key, share in vars(self.pace).items():
-            if share != 1:
+        for key, value in {**vars(self.pace), "denoise": self.denoise}.items():
+            if value != 1:
                 raise InputError(
                     f"Policy 'hlp' chooses subtasks and does not move; leave '{key}' at 1."
                 )

@@ -36,6 +36,7 @@ from surgicai_vision.evaluation.agent import (
     frame_of,
     image_of,
 )
+from surgicai_vision.evaluation.denoised_agent import DenoisedAgent
 from surgicai_vision.scene.cameras import CameraPose, Crop, crop_of
 from surgicai_vision.scene.crops import whole_size
 
@@ -83,7 +84,10 @@ def aimed(spec: "PolicySpec", detector: str | Path) -> "PolicySpec":
 
 def _make_aimed(make: MakeAgent, folder: Path) -> Agent:
     """Make the agent (in a worker process)."""
-    return AimedAgent(make(), load_detector(folder))
+    agent, detector = make(), load_detector(folder)
+    if isinstance(agent, DenoisedAgent):  # whole images stand still, crops about the jaws do not
+        return DenoisedAgent(AimedAgent(agent.agent, detector), agent.frames)
+    return AimedAgent(agent, detector)
 
 
 @final

@@ -45,6 +45,7 @@ from surgicai_vision.evaluation.agents import (
     mean_demonstration,
 )
 from surgicai_vision.evaluation.chunk_agent import ChunkAgent
+from surgicai_vision.evaluation.denoised_agent import DenoisedAgent
 from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
 from surgicai_vision.evaluation.hierarchical_config import (
     HLP,
@@ -353,6 +354,8 @@ def _from_checkpoint(folder: Path, weights: WeightsSource, changes: tuple[str, .
     acted_by = read_changes(changes)
     if acted_by:
         policies.restore(checkpoint, acted_by)  # refuses what is not allowed
+    if "denoise" in acted_by and encoder is None:
+        raise InputError(f"{folder} sees no images that could be averaged; leave denoise out.")
     make = functools.partial(acting_agent, folder, weights, acted_by)
     run = replace(checkpoint.run, acted_by=changes)
     return PolicySpec(run, make, about, f"seed{run.seed}")
@@ -386,11 +389,12 @@ def acting_agent(
         BadFile: the policy whose progress it is fed is not in its folder.
     """
     policy = policies.load_policy(folder, changes)
-    agent = _agent_of(policy, weights)
-    if not isinstance(policy, ChunkPolicy):
-        return agent
-    translation, _, _ = STEPS[policy.checkpoint.task.step]
-    return ChunkAgent(policy, agent, translation)
+    senses = _agent_of(policy, weights)
+    agent: Agent = senses
+    if isinstance(policy, ChunkPolicy):
+        translation, _, _ = STEPS[policy.checkpoint.task.step]
+        agent = ChunkAgent(policy, senses, translation)
+    return DenoisedAgent(agent, policy.denoise) if policy.denoise > 1 else agent
 
 
 def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent:

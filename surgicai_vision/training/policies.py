@@ -266,6 +266,7 @@ def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> 
     policy.eval().requires_grad_(False)
     policy.checkpoint = checkpoint
     policy.pace = recipe.pace
+    policy.denoise = recipe.denoise
     return policy
 
 

@@ -244,7 +244,7 @@ def test_how_chunks_are_acted_is_changed_without_a_training(
         (
             {"chunk": 2},
             UnknownName,
-            "clock_speed, ensemble, execute, jaw_speed, measure_delay, samples, speed",
+            "clock_speed, denoise, ensemble, execute, jaw_speed, measure_delay, samples, speed",
         ),
         ({"excute": 1}, UnknownName, "Did you mean 'execute'"),
     ):
@@ -270,6 +270,8 @@ def test_an_evaluation_says_how_chunks_were_acted(tmp_path: Path, registered: No
     assert open_policy(tmp_path / "b", changes=("speed=0.5",)).name.endswith("-acting+speed=0.5")
     with pytest.raises(InputError, match="'bc' answers with one action"):
         open_policy(tmp_path / "b", changes=("execute=1",))
+    with pytest.raises(InputError, match="sees no images that could be averaged"):
+        open_policy(tmp_path / "b", changes=("denoise=6",))
 
 
 def test_a_broken_off_training_ends_the_same(tmp_path: Path, registered: None) -> None:
