@@ -9,7 +9,7 @@ import pytest
 from surgicai_vision.commands.main import main
 from surgicai_vision.commands.sweep import read_experiment
 from surgicai_vision.core import names
-from surgicai_vision.core.config import CLOCK_PERIOD, RANDOMISATION_LIMITS
+from surgicai_vision.core.config import CLOCK_PERIOD, RANDOMISATION_LIMITS, TaskConfig
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.detection.card import RELEASED, detector_folder, read_card
 from surgicai_vision.envs.feasibility import refuse_impossible
@@ -74,17 +74,26 @@ def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
         "all axes at half strength with aimed crops",
         "needles never seen",
     )
-    # Two policies per subtask, three of the placement, in two training seeds.
-    assert by_condition(UNMOVED) == dict.fromkeys(conditions, 2 * 11)
+    # Two policies per subtask, three of the placement, in two training seeds; one grasp has seen
+    # needles as large and as small as those that are never seen.
+    assert by_condition(UNMOVED) == {
+        **dict.fromkeys(conditions, 2 * 11),
+        "needles never seen": 2 * 10,
+    }
     assert {run.task for run in UNMOVED.runs} == set(names.SUBTASKS)
     assert UNMOVED.seed == (0, 1)
     looks = {shows(dataset).appearance for dataset in UNMOVED.datasets.values()}
     assert looks == {names.TRAIN, names.VARIED}
     worlds = {run.condition: run.env.randomisation for run in UNMOVED.runs}
     trained = worlds["held-in looks"]
-    assert {
-        replace(shows(dataset), appearance=names.TRAIN) for dataset in UNMOVED.datasets.values()
-    } == {trained}
+    off = shifted_config(TaskConfig("grasp", randomisation=trained), AXES["needle"], 0.5)
+    wide = {name for name in UNMOVED.datasets if name.endswith("/grasp-robust")}
+    assert wide == {"seed0/grasp-robust", "seed1/grasp-robust"}
+    for name, dataset in UNMOVED.datasets.items():
+        world = off.randomisation if name in wide else trained
+        assert replace(shows(dataset), appearance=names.TRAIN) == world
+    unseen_by = {run.demonstrations for run in UNMOVED.runs if run.condition == conditions[-1]}
+    assert unseen_by == {4000, 3500, 3000, 2000}, "and not those of `grasp-robust`"
     heldout = worlds["held-out looks"]
     assert heldout.shows_heldout and not trained.shows_heldout
     unseen = worlds["needles never seen"]
