@@ -105,21 +105,19 @@ class DenoisedAgent(WrappedAgent):
     ) -> Actions:
         """Return the agent's actions (n, 7) on the means."""
         seen = [
-            self._seen(self._means[slot], observation)
+            self.averaged(slot, observation)
             for slot, observation in zip(slots, observations, strict=True)
         ]
         return self.agent.act(slots, robots, seen)
 
-    def _forget(self, slot: int) -> None:
-        self._means[slot] = {camera: StillMean(self.frames) for camera in self.cameras}
-
-    def _seen(self, means: dict[str, StillMean], observation: Observation) -> Observation:
-        """Return an observation with each camera's mean in place of its image.
+    def averaged(self, slot: int, observation: Observation) -> Observation:
+        """Return the slot's next observation with each camera's mean in place of its image.
 
         Every image is read, in every step, also by an agent that would look at some only.
         """
         if not self.cameras:
             return observation
+        means = self._means[slot]
         others = {
             key: functools.partial(frame_of, observation, key)
             for key in observation
@@ -127,3 +125,7 @@ class DenoisedAgent(WrappedAgent):
         }
         images = {key: mean.updated(image_of(observation, key)) for key, mean in means.items()}
         return LazyMapping(others, images)
+
+    def _forget(self, slot: int) -> None:
+        """Forget the slot's images."""
+        self._means[slot] = {camera: StillMean(self.frames) for camera in self.cameras}

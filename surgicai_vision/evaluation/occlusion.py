@@ -28,6 +28,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.agent import Agent, Env, FeatureTable, Observation
 from surgicai_vision.evaluation.aimed_agent import AimedAgent
+from surgicai_vision.evaluation.denoised_agent import DenoisedAgent
 from surgicai_vision.evaluation.slot import env_of
 from surgicai_vision.scene.rendering import Frame
 
@@ -119,6 +120,8 @@ def occlusion(
         InputError: a policy without images or of the whole procedure, no step within the episode,
             or a square that does not fit into the image.
     """
+    still = agent if isinstance(agent, DenoisedAgent) else None
+    agent = still.agent if still else agent
     aim = agent if isinstance(agent, AimedAgent) else None
     agent = aim.agent if aim else agent
     _check(agent, config, steps, patch)
@@ -133,6 +136,8 @@ def occlusion(
     features: FeatureTable = {}
     agent.share(features)
     observation, info = env.reset(seed=seed)
+    if still:
+        still.reset(0, env, seed)
     for slot in range(1 + len(wanted) * len(hidden)):
         agent.reset(slot, env, seed)
     found: list[Sensitivity] = []
@@ -140,7 +145,8 @@ def occlusion(
     ended = False
     while not ended:
         features.clear()
-        seen = _drawn(aim.crops(observation) if aim else observation)
+        whole = still.averaged(0, observation) if still else observation
+        seen = _drawn(aim.crops(whole) if aim else whole)
         now = asked.pop(taken, range(0))
         later = [slot for slots in asked.values() for slot in slots]
         others = [_without(seen, view, place) for view, place in hidden] if now else []

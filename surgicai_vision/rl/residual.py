@@ -197,7 +197,13 @@ def base_of(request: ResidualRequest, weights: WeightsSource = ANYWHERE) -> Poli
             f"{request.base} is '{spec.run.policy}' of '{spec.run.task}'; only a "
             "behaviour-cloning (bc) policy of one subtask can be corrected."
         )
-    if read_checkpoint(released.resolve(request.base)).progress_sha256:
+    checkpoint = read_checkpoint(released.resolve(request.base))
+    if checkpoint.recipe.get("denoise", 1) != 1:
+        raise InputError(
+            f"{request.base} acts on averaged images (denoise), which a correction does not see; "
+            "give a policy without denoise."
+        )
+    if checkpoint.progress_sha256:
         raise InputError(
             f"{request.base} uses another policy's progress; give a policy with a clock."
         )

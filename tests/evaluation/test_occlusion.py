@@ -13,6 +13,7 @@ from surgicai_vision.evaluation import occlusion as module
 from surgicai_vision.evaluation.agent import Agent, frame_of
 from surgicai_vision.evaluation.agents import ZeroAgent
 from surgicai_vision.evaluation.aimed_agent import AimedAgent
+from surgicai_vision.evaluation.denoised_agent import DenoisedAgent
 from surgicai_vision.evaluation.occlusion import occlusion, overlaid, squares
 
 SIZE = 48
@@ -162,6 +163,20 @@ def test_parts_of_aimed_crops_are_hidden_from_the_policy_and_not_from_the_detect
     assert one.view == "front_psm2" and one.image.shape == (SIZE, SIZE, 3)
     assert not np.array_equal(one.image, other.image) and one.change.max() > 0
     assert [detector.asked for detector in detectors] == [CONFIG.max_steps] * 2
+
+
+def test_parts_of_averaged_images_are_hidden_after_they_are_averaged():
+    place = FixedDetector(0.4)
+    plain, averaged = (
+        occlusion(agent, CONFIG, 3, (0, 1), 16)
+        for agent in (
+            AimedAgent(CropAgent(), place),
+            DenoisedAgent(AimedAgent(CropAgent(), place), 6),
+        )
+    )
+    for one, other in zip(plain.found, averaged.found, strict=True):
+        assert (one.view, one.step) == (other.view, other.step) and other.change.max() > 0
+    assert np.array_equal(plain.found[0].image, averaged.found[0].image), "the first as it is"
 
 
 def make_crop_agent():

@@ -209,6 +209,11 @@ def test_only_a_cloned_policy_of_one_subtask_is_corrected(base, tmp_path):
     write_checkpoint(tmp_path / "fed", fed, BC.make(recipe, ()).state_dict())
     with pytest.raises(InputError, match="uses another policy's progress"):
         train_residual(request_of(str(tmp_path / "fed")), tmp_path / "again")
+    averaging = BC.recipe(denoise=6)
+    made = dataclasses.replace(read_checkpoint(base), recipe=to_mapping(averaging))
+    write_checkpoint(tmp_path / "averaging", made, BC.make(averaging, ()).state_dict())
+    with pytest.raises(InputError, match="acts on averaged images"):
+        train_residual(request_of(str(tmp_path / "averaging")), tmp_path / "again")
     with pytest.raises(InputError, match="success_steps"):
         ResidualRequest(base, settings=residual_settings({"success_steps": 3}))
     with pytest.raises(InputError, match="stop_at"):
