@@ -381,6 +381,15 @@ def test_a_killed_batch_job_is_submitted_again(tmp_path, monkeypatch):
     assert not done and "died 2 times" in said and output.is_file()
 
 
+@pytest.fixture
+def interruptible():
+    """Let Ctrl-C reach children also where a shell runs the tests in the background (`… &`)."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_run_cancels_its_batch_jobs(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(Path(fake_jobs.__file__).parent))
     jobs = [*squares([1]), Job("slow", {"number": 2, "seconds": 3600})]
