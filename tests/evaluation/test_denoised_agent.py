@@ -38,7 +38,7 @@ def noisy(image, rng, sigma=SIGMA):
 
 
 def error(image, truth):
-    """Root mean square error away from the borders [grey levels]."""
+    """Root mean square error [grey levels]."""
     return float(np.sqrt(np.mean((image.astype(float) - truth) ** 2)))
 
 
@@ -155,7 +155,7 @@ def test_noise_of_a_camera_is_averaged_in_an_episode():
     looking = Looking()
     config = TaskConfig("grasp", max_steps=6)
     run = RunConfig(config, OWN, Looking.cameras, policy="looking")
-    clean, seen = [], {}
+    seen = {}
     for name, make, noise in (
         ("clean", lambda: looking, 0.0),
         ("noisy", lambda: looking, 0.5),
