@@ -107,7 +107,7 @@ class Recipe:
             everywhere, or multiplies it by, then does not reach the head.
         speed: share of each action that is executed, above 0 and at most 1; the clock runs as much
             slower. It does not affect what is learned (docs/evaluation.md); see `Pace`.
-        jaw_speed, clock_speed: see `Pace`; they do not affect what is learned either.
+        jaw_speed, clock_speed, retry_after: see `Pace`; they do not affect what is learned either.
         denoise: most successive images that are averaged wherever they stand still, when the policy
             acts (`evaluation.denoised_agent`); 1 leaves images as they are. It does not affect what
             is learned.
@@ -136,6 +136,7 @@ class Recipe:
     speed: float = field(default=1.0, metadata=LATER)
     jaw_speed: float = field(default=1.0, metadata=LATER)
     clock_speed: float = field(default=1.0, metadata=LATER)
+    retry_after: int = field(default=0, metadata=LATER)
     denoise: int = field(default=1, metadata=LATER)
 
     def __post_init__(self) -> None:
@@ -185,12 +186,17 @@ class Recipe:
             )
         if not 0 <= self.validation < 1:
             raise InputError(f"validation is {self.validation}; give a share from 0 to below 1.")
+        if self.retry_after and not self.clock:
+            raise InputError(
+                f"retry_after is {self.retry_after}, but the policy has no clock that could go on "
+                "to the next attempt; leave it at 0, or give clock=true."
+            )
         _ = self.pace
 
     @property
     def pace(self) -> Pace:
         """How fast a policy of this recipe acts."""
-        return Pace(self.speed, self.jaw_speed, self.clock_speed)
+        return Pace(self.speed, self.jaw_speed, self.clock_speed, self.retry_after)
 
 
 @dataclass(frozen=True)

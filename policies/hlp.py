@@ -26,6 +26,7 @@ from torch import nn
 from policies.base import Inputs, Plugin, Policy, Recipe
 from policies.layers import FeatureMLP
 from surgicai_vision.core import names
+from surgicai_vision.core.config import FULL_SPEED
 from surgicai_vision.core.errors import InputError, check_at_least
 
 CLASSES = len(names.SUBTASKS)
@@ -52,10 +53,12 @@ class HLPRecipe(Recipe):
         for name in ("privileged", "setpoint", "progress_input"):
             if getattr(self, name):
                 raise InputError(f"Policy 'hlp' sees both arms and images; leave '{name}' off.")
-        for key, value in {**vars(self.pace), "denoise": self.denoise}.items():
-            if value != 1:
+        still = {**vars(FULL_SPEED), "denoise": 1}
+        for key, default in still.items():
+            if getattr(self, key) != default:
                 raise InputError(
-                    f"Policy 'hlp' chooses subtasks and does not move; leave '{key}' at 1."
+                    "Policy 'hlp' chooses subtasks and does not move; "
+                    f"leave '{key}' at {default:g}."
                 )
 
 

@@ -21,6 +21,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import (
     InputError,
     UnknownName,
+    check_at_least,
     check_at_most,
     check_name,
     check_positive,
@@ -51,6 +52,9 @@ DWELL = 15
 """Control steps for which a subtask's success must hold in a whole procedure before the next."""
 CLOCK_PERIOD = 25
 """Period of the sine and cosine of `clock` [control steps]."""
+SECOND_ATTEMPT_STEP = 100
+"""Control step at which the second attempt of a search begins (`demos.search_expert`), since the
+expert's own grasp takes 70 to 85; another one follows every `CLOCK_PERIOD`."""
 CLOCK_SIZE = 3
 """Length of what `clock` returns."""
 LARGEST_INTEGER = 2**63 - 1
@@ -527,7 +531,7 @@ def clock(steps: "NDArray[np.int64] | NDArray[np.float64]") -> "NDArray[np.float
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a policy acts: shares of what it answers, each above 0 and at most 1.
+    """How fast a policy acts: three shares, each above 0 and at most 1, and when it tries again.
 
     Where actions take effect late, a policy at full speed swings about its goal, its jaws swing
     open and closed, and its clock says that it is there before it is (docs/evaluation.md).
@@ -536,16 +540,22 @@ class Pace:
         speed: share of each action that is executed; the clock runs as much slower.
         jaw_speed: share of the jaw's motion that is executed besides.
         clock_speed: how much slower the clock runs besides.
+        retry_after: control steps with shut jaws after which the clock of a policy that has learned
+            a search goes on to the next attempt (`evaluation.policy_clock`); 0: it waits for it.
     """
 
     speed: float = 1.0
     jaw_speed: float = 1.0
     clock_speed: float = 1.0
+    retry_after: int = 0
 
     def __post_init__(self) -> None:
-        for key, share in vars(self).items():
+        for key in ("speed", "jaw_speed", "clock_speed"):
+            share = getattr(self, key)
             if not 0 < share <= 1:
                 raise InputError(f"{key} is {share}; give a share above 0, at most 1.")
+        check_at_least(0, retry_after=self.retry_after)
+        check_at_most(SUBTASK_STEPS, retry_after=self.retry_after)
 
     @property
     def executed(self) -> "NDArray[np.float32]":

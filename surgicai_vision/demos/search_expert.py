@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.core.config import CLOCK_PERIOD
+from surgicai_vision.core.config import CLOCK_PERIOD, SECOND_ATTEMPT_STEP
 from surgicai_vision.demos.demonstrator import ON_AIM, Demonstrator, Miss
 from surgicai_vision.demos.expert import (
     HOVER,
@@ -42,9 +42,6 @@ class SearchExpert(Demonstrator):
 
     ATTEMPTS = (12.5, 6.5, 18.5, 2.5, 22.5)
     """Angles at which a needle of 120° is grasped, one attempt after another [deg]."""
-    SECOND_ATTEMPT_STEP = 100
-    """Control step of the second attempt, since the expert's own grasp takes 70 to 85. Another one
-    follows every `CLOCK_PERIOD`, the period of the clock that policies get as an input."""
     OPENING_STEPS = 8
     OPEN_JAW = 0.22
     """Control steps for which the jaws open before another attempt, and how far [rad], to slide
@@ -76,7 +73,7 @@ class SearchExpert(Demonstrator):
 
     def _target(self, world: WorldState, step: int) -> ToolTarget:
         """Grasp the needle as the present attempt does, or open before a new one."""
-        period, steps_into_period = divmod(step - self.SECOND_ATTEMPT_STEP, CLOCK_PERIOD)
+        period, steps_into_period = divmod(step - SECOND_ATTEMPT_STEP, CLOCK_PERIOD)
         attempt = min(max(0, period + 1), len(self.ATTEMPTS) - 1)
         if attempt and steps_into_period < self.OPENING_STEPS:
             return ToolTarget(world.command, self.OPEN_JAW)

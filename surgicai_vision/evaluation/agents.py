@@ -22,6 +22,7 @@ from surgicai_vision.evaluation.agent import (
     image_of,
     simulated,
 )
+from surgicai_vision.evaluation.policy_clock import PolicyClock
 from surgicai_vision.training.progress_input import PROGRESS_AT
 from surgicai_vision.training.threads import one_thread
 
@@ -219,6 +220,7 @@ class PolicyAgent(Agent):
         self.action_repeat = action_repeat
         self.pace = pace
         self._ticks: dict[int, int] = {}
+        self._clocks: dict[int, PolicyClock] = {}
         self._shared: FeatureTable | None = None
 
     def share(self, features: FeatureTable) -> None:
@@ -234,45 +236,52 @@ class PolicyAgent(Agent):
     def restart(self, slot: int) -> None:
         """Restart the slot's clock: a subtask begins."""
         self._ticks[slot] = 0
+        self._clocks[slot] = self.new_clock()
+
+    def new_clock(self) -> PolicyClock:
+        """Return a clock that begins with a subtask and runs at the policy's pace."""
+        return PolicyClock(self.pace, self.action_repeat)
 
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the policy's actions (n, 7), at its pace."""
-        ticks = [self._ticks[slot] for slot in slots]
-        self._ticks.update({slot: tick + 1 for slot, tick in zip(slots, ticks, strict=True)})
-        return self.answer(robots, observations, ticks) * self.pace.executed
+        times = [
+            self._clocks[slot].read(self._ticks[slot], robot)
+            for slot, robot in zip(slots, robots, strict=True)
+        ]
+        self._ticks.update({slot: self._ticks[slot] + 1 for slot in slots})
+        return self.answer(robots, observations, times) * self.pace.executed
 
     def answer(
         self,
         robots: Sequence[Robot],
         observations: Sequence[Observation],
-        ticks: Sequence[int] | None = None,
+        times: Sequence[float] | None = None,
     ) -> NDArray[np.float32]:
         """Return the policy's answers (n, …): actions, or a high-level policy's logits.
 
         Args:
             robots: the robots, for proprioception.
             observations: their observations.
-            ticks: actions since each robot's subtask began, for a policy with a clock.
+            times: what each robot's clock says (`PolicyClock`), for a policy with a clock.
         """
         with one_thread():
-            vectors = self.vectors(robots, observations, ticks)
+            vectors = self.vectors(robots, observations, times)
             return np.asarray(self.policy.act(self.features(observations), vectors), np.float32)
 
     def vectors(
         self,
         robots: Sequence[Robot],
         observations: Sequence[Observation],
-        ticks: Sequence[int] | None = None,
+        times: Sequence[float] | None = None,
     ) -> NDArray[np.float32]:
         """Return the inputs besides the features, (n, …); see `answer`."""
         vectors = np.stack(
             [np.concatenate([told(robot) for told in self._told]) for robot in robots]
         )
-        if self._clocked and ticks is not None:
-            clocks = clock(np.array(ticks) * self.action_repeat * self.pace.clock)
-            vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)
+        if self._clocked and times is not None:
+            vectors = np.concatenate([vectors, clock(np.array(times))], axis=1, dtype=np.float32)
         if self._progress is not None:
             said = self._progress.answer(robots, observations)[:, PROGRESS_AT:]
             vectors = np.concatenate([vectors, said], axis=1, dtype=np.float32)

@@ -27,6 +27,7 @@ from policies.chunks import ChunkPolicy
 from surgicai_vision.evaluation.agent import Actions, Agent, FeatureTable, Observation, Robot
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.delay import DelayMeter
+from surgicai_vision.evaluation.policy_clock import PolicyClock
 from surgicai_vision.training.threads import one_thread
 
 SEED_STRIDE = 1_000_003
@@ -55,11 +56,13 @@ class _Episode:
         tick: actions since its subtask began.
         meter: measures the delay; None if it is not asked for.
         past: the last moments, the present one last.
+        clock: tells the policy the time.
         plans: (tick at which its first action is due, its actions (chunk, 7)), the oldest first.
     """
 
     seed: int
     past: deque[_Moment]
+    clock: PolicyClock
     tick: int = 0
     meter: DelayMeter | None = None
     plans: list[tuple[int, NDArray[np.float32]]] = field(default_factory=list)
@@ -107,7 +110,8 @@ class ChunkAgent(Agent):
         moments = (self._policy.history - 1) * self._spacing + 1
         longest = self._policy.chunk - 1  # the delay that a chunk spans
         meter = DelayMeter(self._step, longest) if self._policy.measure_delay else None
-        self._episodes[slot] = _Episode(seed, deque(maxlen=moments), meter=meter)
+        clock = self._senses.new_clock()
+        self._episodes[slot] = _Episode(seed, deque(maxlen=moments), clock, meter=meter)
 
     def restart(self, slot: int) -> None:
         """Forget what the slot has planned and seen: its subtask begins."""
@@ -122,8 +126,11 @@ class ChunkAgent(Agent):
             if episode.meter is not None:
                 episode.meter.see(robot.agent_pos())
         with one_thread():
-            ticks = [episode.tick - episode.late for episode in episodes]
-            vectors = self._senses.vectors(robots, observations, ticks)
+            times = [
+                episode.clock.read(episode.tick - episode.late, robot)
+                for episode, robot in zip(episodes, robots, strict=True)
+            ]
+            vectors = self._senses.vectors(robots, observations, times)
             features = self._features(episodes, observations)
             for episode, seen, vector in zip(episodes, features, vectors, strict=True):
                 episode.past.append(_Moment(seen, vector))

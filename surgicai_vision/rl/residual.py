@@ -78,6 +78,7 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
         self._exact = policy.exact()
         self._env = env_of(agent, task)
         self._ticks = 0
+        self._clock = agent.new_clock()
         self._base = np.zeros(ACTIONS, np.float32)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (policy.sight,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
@@ -91,6 +92,7 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
         seen, _ = self._env.reset(seed=start)
         self._agent.reset(0, self._env, start)
         self._ticks = 0
+        self._clock = self._agent.new_clock()
         return self._sight(seen), {}
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
@@ -117,7 +119,8 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
         """Return the correction's input in the present state; store the frozen policy's action."""
         agent = self._agent
         features = agent.features([seen])
-        vectors = agent.vectors([self._env], [seen], [self._ticks])
+        time = self._clock.read(self._ticks, self._env)
+        vectors = agent.vectors([self._env], [seen], [time])
         exact = self._exact
         with torch.inference_mode():
             observed = torch.from_numpy(exact.observed(features, vectors))

@@ -18,6 +18,7 @@ from surgicai_vision.core.config import JSON, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name, shown
 from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.core.plugins import POLICIES_GROUP, Registry, instance_of, resolve, uncallable
+from surgicai_vision.demos.demonstrator import GOAL_FREE_DEMONSTRATORS
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training import released
 from surgicai_vision.training.checkpoint import (
@@ -219,6 +220,26 @@ def check_progress_from(recipe: "Recipe", progress_from: Path | None) -> None:
         )
 
 
+def check_retries(recipe: "Recipe", task: str, demonstrator: str | None) -> None:
+    """Refuse `retry_after` where no further attempts were demonstrated.
+
+    Args:
+        recipe: how the policy acts.
+        task: what it does.
+        demonstrator: who demonstrated it; None if unknown.
+    """
+    if not recipe.retry_after:
+        return
+    if task == "grasp" and demonstrator in (None, *GOAL_FREE_DEMONSTRATORS):
+        return
+    learned = f"'{task}'" if demonstrator is None else f"'{task}' from '{demonstrator}'"
+    raise InputError(
+        f"retry_after is {recipe.retry_after}, but the policy learns {learned}, which has no "
+        "further attempts to go on to; it is for a grasp that was demonstrated by "
+        f"{' or '.join(sorted(GOAL_FREE_DEMONSTRATORS))}."
+    )
+
+
 def load_policy(folder: Path | str, changes: Mapping[str, JSON] = UNCHANGED) -> "Policy":
     """Load a trained policy from a checkpoint folder or by its name `released:NAME`, verified.
 
@@ -245,7 +266,8 @@ def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> 
 
     Raises:
         UnknownName: a setting that affects what is learned, or does not exist.
-        InputError: a value that is not allowed, or a setting of chunks for a policy without them.
+        InputError: a value that is not allowed, a setting of chunks for a policy without them, or
+            retries for one that has learned no search.
     """
     plugin = policy_plugin(checkpoint.policy)
     for name in changes:
@@ -256,6 +278,7 @@ def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> 
                 "only policies that plan chunks have one."
             )
     recipe = from_mapping(plugin.recipe, {**checkpoint.recipe, **changes})
+    check_retries(recipe, checkpoint.task.task, checkpoint.run.demonstrator)
     try:
         policy = plugin.make(recipe, checkpoint.visual)
         policy.load_state_dict(read_tensors(checkpoint))

@@ -16,6 +16,8 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import (
     CLOCK_PERIOD,
     CLOCK_SIZE,
+    FULL_SPEED,
+    SECOND_ATTEMPT_STEP,
     SUBTASK_STEPS,
     Pace,
     RandomisationConfig,
@@ -30,7 +32,7 @@ from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.starts import GRASP_ANGLES
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.scene.holes import PAIRS, HolePair
-from surgicai_vision.training.policies import load_policy
+from surgicai_vision.training.policies import check_retries, load_policy
 from surgicai_vision.training.train import train
 
 
@@ -55,8 +57,8 @@ def test_it_meets_every_goal_and_reads_none() -> None:
         for _, actions in tried[1:]:
             np.testing.assert_array_equal(actions[:shortest], tried[0][1][:shortest])
     second, third = (
-        SearchExpert.SECOND_ATTEMPT_STEP,
-        SearchExpert.SECOND_ATTEMPT_STEP + CLOCK_PERIOD,
+        SECOND_ATTEMPT_STEP,
+        SECOND_ATTEMPT_STEP + CLOCK_PERIOD,
     )
     steps = [len(grasp(env, 500_000, goal)[1]) for goal in (12.5, 5.0, 20.0)]
     assert steps[0] < second < steps[1] < third < steps[2] < SUBTASK_STEPS
@@ -80,7 +82,7 @@ def test_its_demonstrations_show_every_attempt() -> None:
     assert result.success and len(result.demo) == env.config.max_steps and result.demo.success.any()
     closing = result.demo.action[:, 6] < -0.5
     opening = result.demo.action[:, 6] > 0.5
-    edges = range(SearchExpert.SECOND_ATTEMPT_STEP, env.config.max_steps + 1, CLOCK_PERIOD)
+    edges = range(SECOND_ATTEMPT_STEP, env.config.max_steps + 1, CLOCK_PERIOD)
     assert len(edges) == len(SearchExpert.ATTEMPTS)
     for start, stop in pairwise(edges):
         assert opening[start:stop].any() and closing[start:stop].any()
@@ -169,6 +171,22 @@ def test_the_jaw_and_the_clock_are_slowed_on_their_own(tmp_path: Path) -> None:
         np.testing.assert_array_equal(late[::2], whole[:20])
 
 
+def test_a_policy_whose_jaws_stay_shut_acts_as_in_the_next_attempt(tmp_path: Path) -> None:
+    recipe = Recipe(hidden=(32,), epochs=2, batch_size=32, clock=True)
+    train(Stepped(), [], BC, recipe, out=tmp_path / "clocked")
+    policy = load_policy(tmp_path / "clocked", {"retry_after": 8})
+
+    def acted(pace: Pace) -> np.ndarray:
+        agent = PolicyAgent("a", policy, None, (), 224, policy.inputs.vector, pace=pace)
+        agent.reset(0, Still(), 0)
+        return np.array([agent.act([0], [Still()], [None])[0] for _ in range(120)])
+
+    assert Still().agent_pos()[6] == 0, "its jaws are shut"
+    waiting, again = acted(FULL_SPEED), acted(policy.pace)
+    np.testing.assert_array_equal(again[:7], waiting[:7])
+    np.testing.assert_array_equal(again[7:27], waiting[SECOND_ATTEMPT_STEP:])
+
+
 def test_a_clock_goes_with_proprioception() -> None:
     with pytest.raises(InputError, match="clock needs proprioception"):
         replace(Recipe(), clock=True, proprioception=False)
@@ -179,3 +197,13 @@ def test_a_clock_whose_hand_stands_still_in_all_frames_is_refused() -> None:
         with pytest.raises(InputError, match="would have the same value in all training frames"):
             Recipe(clock=True, frame_stride=stride)
     assert Recipe(clock=True, frame_stride=10).frame_stride == 10
+
+
+def test_only_a_policy_that_has_learned_a_search_tries_again() -> None:
+    recipe = replace(Recipe(), clock=True, retry_after=8)
+    for task, demonstrator in (("grasp", "search"), ("grasp", None)):
+        check_retries(recipe, task, demonstrator)
+    for task, demonstrator in (("grasp", "expert"), ("place", "expert"), ("place", None)):
+        check_retries(replace(recipe, retry_after=0), task, demonstrator)
+        with pytest.raises(InputError, match="no further attempts to go on to"):
+            check_retries(recipe, task, demonstrator)
