@@ -246,12 +246,17 @@ class PolicyAgent(Agent):
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the policy's actions (n, 7), at its pace."""
+        times = self.times(slots, robots)
+        return self.answer(robots, observations, times) * self.pace.executed
+
+    def times(self, slots: Sequence[int], robots: Sequence[Robot]) -> list[float]:
+        """Return what each slot's clock says, and let it run on; called once for each action."""
         times = [
             self._clocks[slot].read(self._ticks[slot], robot)
             for slot, robot in zip(slots, robots, strict=True)
         ]
         self._ticks.update({slot: self._ticks[slot] + 1 for slot in slots})
-        return self.answer(robots, observations, times) * self.pace.executed
+        return times
 
     def answer(
         self,

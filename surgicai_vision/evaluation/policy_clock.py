@@ -12,11 +12,12 @@ clock reads the arm's own jaw and nothing else.
 
 from typing import final
 
+from surgicai_vision.core import names
 from surgicai_vision.core.config import CLOCK_PERIOD, FULL_SPEED, SECOND_ATTEMPT_STEP, Pace
 from surgicai_vision.core.tasks import SUBTASK_STEPS
 from surgicai_vision.evaluation.agent import Robot
 
-JAW = 6
+JAW = names.STATE_NAMES.index("jaw")
 """Where `Robot.agent_pos` has the jaw."""
 
 SHUT = 0.06

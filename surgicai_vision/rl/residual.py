@@ -77,8 +77,6 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
         self._policy = policy
         self._exact = policy.exact()
         self._env = env_of(agent, task)
-        self._ticks = 0
-        self._clock = agent.new_clock()
         self._base = np.zeros(ACTIONS, np.float32)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (policy.sight,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
@@ -91,8 +89,6 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
         start = int(self.np_random.integers(names.VALIDATION_SEED))
         seen, _ = self._env.reset(seed=start)
         self._agent.reset(0, self._env, start)
-        self._ticks = 0
-        self._clock = self._agent.new_clock()
         return self._sight(seen), {}
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
@@ -110,7 +106,6 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
             sight = np.zeros(self._policy.sight, np.float32)
             return sight, -1.0, True, False, {"is_success": False}
         seen, _, terminated, truncated, info = step
-        self._ticks += 1
         is_success = bool(info["is_success"])
         reward = 0.0 if is_success else -1.0
         return self._sight(seen), reward, terminated, truncated, {"is_success": is_success}
@@ -119,8 +114,7 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
         """Return the correction's input in the present state; store the frozen policy's action."""
         agent = self._agent
         features = agent.features([seen])
-        time = self._clock.read(self._ticks, self._env)
-        vectors = agent.vectors([self._env], [seen], [time])
+        vectors = agent.vectors([self._env], [seen], agent.times([0], [self._env]))
         exact = self._exact
         with torch.inference_mode():
             observed = torch.from_numpy(exact.observed(features, vectors))

@@ -56,10 +56,7 @@ def test_it_meets_every_goal_and_reads_none() -> None:
         shortest = min(len(actions) for _, actions in tried)
         for _, actions in tried[1:]:
             np.testing.assert_array_equal(actions[:shortest], tried[0][1][:shortest])
-    second, third = (
-        SECOND_ATTEMPT_STEP,
-        SECOND_ATTEMPT_STEP + CLOCK_PERIOD,
-    )
+    second, third = SECOND_ATTEMPT_STEP, SECOND_ATTEMPT_STEP + CLOCK_PERIOD
     steps = [len(grasp(env, 500_000, goal)[1]) for goal in (12.5, 5.0, 20.0)]
     assert steps[0] < second < steps[1] < third < steps[2] < SUBTASK_STEPS
 
