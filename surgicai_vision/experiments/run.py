@@ -72,7 +72,7 @@ def train_run(
     """
     recipe = policies.recipe_of(run)
     policies.check_progress_from(recipe, progress_from)
-    policies.check_retries(recipe, dataset.config.task, run.demonstrator)
+    policies.check_retries(recipe, subtask or dataset.config.task, run.demonstrator)
     plugin = policies.policy_plugin(run.policy)
     if plugin.offsets is not None:
         plugin.make(recipe, ())  # refuses its settings before anything is encoded

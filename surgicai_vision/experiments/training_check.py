@@ -51,7 +51,8 @@ def check_training(run: RunConfig, dataset: DatasetConfig, subtask: str | None) 
         )
     recipe = policies.recipe_of(run)
     policies.check_progress_from(recipe, None)
-    policies.check_retries(recipe, dataset.env.task, dataset.demonstrations.demonstrator)
+    learned = subtask or dataset.env.task
+    policies.check_retries(recipe, learned, dataset.demonstrations.demonstrator)
     held = _held(dataset)
     if recipe.frame_stride % held:
         raise InputError(

@@ -42,6 +42,8 @@ TABLE = {
 }
 NARROW = {"needle_size": 0.2, "pair": "any"}
 """Some needles of these are too small for some pair of holes."""
+WHOLE = {**DEMONSTRATIONS, "task": "suture", "demonstrator": "search"}
+TRYING = {**POLICY, "change": ["clock=true", "retry_after=8"]}
 ON_FEW = {**POLICY, "policy": "hlp", "view": []}
 
 
@@ -79,6 +81,10 @@ def test_a_grid_that_cannot_be_trained_is_refused_when_it_is_planned(changed, to
             },
             "few: a policy is trained on them, and view is empty",
         ),
+        # Further attempts are those of the subtask that is learned, not of the whole procedure.
+        ({"demonstrations": [WHOLE], "policies": [{**TRYING, "subtask": "grasp"}]}, ""),
+        ({"demonstrations": [WHOLE], "policies": [{**TRYING, "subtask": "place"}]}, "no further"),
+        ({"demonstrations": [WHOLE], "policies": [TRYING]}, "no further attempts"),
         ({"env": {"randomisation": NARROW}}, "demonstrations seed0/few: .* impossible"),
         (
             {"conditions": [{"name": "any", "env": {"randomisation": NARROW}}]},
