@@ -102,6 +102,8 @@ class Recipe:
         proprioception_noise: noise on the measured poses in training, in standard deviations of
             each value; 0 adds none.
         map_shift: shift feature maps by up to this many places in training; 0 disables shifts.
+        map_overlay: largest share of another frame's feature map that is laid over a map in
+            training, from 0, which lays none over it, to below 0.5.
         instance_norm: standardise each channel of a feature map over its places, image by image
             (Ulyanov et al., Instance normalization, 2016): what a look adds to a channel
             everywhere, or multiplies it by, then does not reach the head.
@@ -132,6 +134,7 @@ class Recipe:
     join_views: bool = False
     proprioception_noise: float = 0.0
     map_shift: int = 0
+    map_overlay: float = field(default=0.0, metadata=LATER)
     instance_norm: bool = field(default=False, metadata=LATER)
     speed: float = field(default=1.0, metadata=LATER)
     jaw_speed: float = field(default=1.0, metadata=LATER)
@@ -178,6 +181,11 @@ class Recipe:
             raise InputError(
                 f"proprioception_noise is {self.proprioception_noise}, map_shift {self.map_shift}; "
                 "neither may be below 0."
+            )
+        if not 0 <= self.map_overlay < 0.5:
+            raise InputError(
+                f"map_overlay is {self.map_overlay}; give a share from 0 to below 0.5, so that a "
+                "map still shows its own frame most."
             )
         if self.proprioception_noise and (self.privileged or not self.proprioception):
             raise InputError(

@@ -6,8 +6,12 @@
 * `with_shift(observed, shapes, places)`: feature maps shifted by whole places (the recipe's
   `map_shift`), as if a crop missed the jaws; DrQ shifts images in the same way (Kostrikov et al.,
   Image augmentation is all you need, ICLR 2021).
+* `with_overlay(observed, shapes, share)`: feature maps with that of another frame laid over them
+  (the recipe's `map_overlay`), so that a policy finds the needle among patterns that do not belong
+  there; Hansen and Wang lay random images over theirs (Generalization in reinforcement learning by
+  soft data augmentation, ICRA 2021).
 
-Both draw from torch's global random state, which `train` seeds, stores and restores.
+All draw from torch's global random state, which `train` seeds, stores and restores.
 """
 
 import math
@@ -73,6 +77,33 @@ def with_shift(
         at += size
     moved[:, at:] = observed[:, at:]
     return moved
+
+
+def with_overlay(
+    observed: torch.Tensor, shapes: Sequence[tuple[int, ...]], share: float, moments: int = 1
+) -> torch.Tensor:
+    """Mix every feature map with the same view's map of another frame of the batch.
+
+    Which frame, and its share, are drawn anew for each frame and view.
+
+    Args:
+        observed: (B, inputs.dim) normalised inputs, the views' features first.
+        shapes: shapes of the features, in order; only maps (C, h, w) are mixed.
+        share: largest share of the other map, from 0 to 1.
+        moments: consecutive rows that form one history; B is a multiple of it. A history is mixed
+            with another one, moment by moment, by the same share.
+    """
+    mixed = observed.clone()
+    at = 0
+    for shape in shapes:
+        size = math.prod(shape)
+        if len(shape) == 3:
+            maps = observed[:, at : at + size].unflatten(0, (-1, moments))
+            other = maps[torch.randperm(len(maps)).to(maps.device)]
+            weight = share * torch.rand(len(maps), 1, 1).to(maps.device)
+            mixed[:, at : at + size] = maps.lerp(other, weight).flatten(0, 1)
+        at += size
+    return mixed
 
 
 def _overlap(move: int, length: int) -> tuple[slice, slice]:

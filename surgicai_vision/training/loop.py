@@ -19,7 +19,7 @@ from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.features.cache import Features
 from surgicai_vision.features.devices import cuda_devices, random_states, set_random_states
-from surgicai_vision.training.augment import with_noise, with_shift
+from surgicai_vision.training.augment import with_noise, with_overlay, with_shift
 from surgicai_vision.training.averages import MovingAverage
 from surgicai_vision.training.checkpoint import (
     Checkpoint,
@@ -271,9 +271,11 @@ class Training:
         inputs = self.policy.inputs
         moments = observed.shape[1] if observed.ndim == 3 else 1
         rows = observed.reshape(-1, inputs.dim)
+        shapes = visual_shapes(recipe, inputs.visual)
         if recipe.map_shift:
-            shapes = visual_shapes(recipe, inputs.visual)
             rows = with_shift(rows, shapes, recipe.map_shift, moments)
+        if recipe.map_overlay:
+            rows = with_overlay(rows, shapes, recipe.map_overlay, moments)
         if recipe.proprioception_noise:
             rows = with_noise(rows, inputs, recipe.proprioception_noise)
         augmented: torch.Tensor = rows.reshape(observed.shape)

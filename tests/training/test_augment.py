@@ -12,7 +12,7 @@ from policies.base import Inputs, Recipe, visual_shapes
 from policies.bc import BC
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.training.augment import with_noise, with_shift
+from surgicai_vision.training.augment import with_noise, with_overlay, with_shift
 from surgicai_vision.training.checkpoint import WEIGHTS
 from surgicai_vision.training.policies import load_policy
 from surgicai_vision.training.train import train
@@ -83,6 +83,34 @@ def test_the_moments_of_a_history_move_together() -> None:
     assert not torch.equal(histories[..., :16], histories[..., 16:]), "so each view"
 
 
+def test_an_overlay_is_a_share_of_another_frame_of_the_same_view() -> None:
+    torch.manual_seed(5)
+    frame = torch.arange(1.0, 201).view(200, 1)
+    observed = torch.cat([frame.expand(200, 18), -frame.expand(200, 18), frame], dim=1)
+    mixed = with_overlay(observed, ((2, 3, 3), (2, 3, 3)), 0.4)
+    assert torch.equal(mixed[:, 36:], observed[:, 36:]), "the vector was mixed"
+    first, second = mixed[:, :18], -mixed[:, 18:36]
+    assert not torch.equal(first, second), "each view by its own draw"
+    for view in (first, second):
+        torch.testing.assert_close(view, view[:, :1].expand(200, 18), msg="one share for a map")
+        # A share s of frame j leaves (1 - s) i + s j: at most .4 of the way to the farthest frame.
+        away = view[:, 0] - frame[:, 0]
+        assert (away > 0).any() and (away < 0).any()
+        assert (away <= 0.4 * (200 - frame[:, 0]) + 1e-4).all()
+        assert (away >= 0.4 * (1 - frame[:, 0]) - 1e-4).all()
+    assert torch.equal(with_overlay(observed, ((2, 3, 3), (2, 3, 3)), 0.0), observed)
+
+
+def test_the_moments_of_a_history_are_mixed_with_those_of_one_other() -> None:
+    torch.manual_seed(6)
+    history = torch.arange(100.0).view(100, 1, 1).expand(100, 3, 4)
+    moment = torch.arange(3.0).view(1, 3, 1) / 10
+    observed = (history + moment).flatten(0, 1)
+    mixed = with_overlay(observed, ((1, 2, 2),), 0.4, moments=3).view(100, 3, 4)
+    torch.testing.assert_close(mixed - moment, (mixed[:, :1]).expand(100, 3, 4))
+    assert not torch.equal(mixed[:, 0], observed.view(100, 3, 4)[:, 0])
+
+
 def test_joined_views_are_one_map_with_all_channels(tmp_path: Path) -> None:
     recipe = replace(QUICK, join_views=True, map_head="convolutions")
     two = ((40, 28, 28), (40, 28, 28))
@@ -116,6 +144,7 @@ def test_augmentation_is_drawn_from_the_training_seed_and_not_when_acting(tmp_pa
         "noise": replace(QUICK, proprioception_noise=0.3),
         "shift": replace(QUICK, map_shift=1),
         "again": replace(QUICK, map_shift=1),
+        "overlay": replace(QUICK, map_overlay=0.4),
     }
     weights = {}
     for name, recipe in recipes.items():
@@ -123,7 +152,7 @@ def test_augmentation_is_drawn_from_the_training_seed_and_not_when_acting(tmp_pa
         train(dataset, views, BC, recipe, out=tmp_path / name)
         weights[name] = (tmp_path / name / WEIGHTS).read_bytes()
     assert weights["plain"] == weights["off"] and weights["shift"] == weights["again"]
-    assert len({weights["plain"], weights["noise"], weights["shift"]}) == 3
+    assert len({weights[name] for name in ("plain", "noise", "shift", "overlay")}) == 4
     policy = load_policy(tmp_path / "shift")
     asked = np.tile(dataset.rows[:4].astype(np.float32), 2), dataset.columns()[names.STATE][:4]
     assert np.array_equal(policy.act(*asked), policy.act(*asked))
@@ -136,3 +165,6 @@ def test_recipes_refuse_augmentation_of_what_is_not_fed() -> None:
         Recipe(proprioception_noise=0.1, privileged=True)
     with pytest.raises(InputError, match="map_shift -1"):
         Recipe(map_shift=-1)
+    for share in (-0.1, 0.5, 1.0):
+        with pytest.raises(InputError, match="map_overlay is"):
+            Recipe(map_overlay=share)
