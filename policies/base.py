@@ -109,7 +109,7 @@ class Recipe:
             everywhere, or multiplies it by, then does not reach the head.
         speed: share of each action that is executed, above 0 and at most 1; the clock runs as much
             slower. It does not affect what is learned (docs/evaluation.md); see `Pace`.
-        jaw_speed, clock_speed, retry_after: see `Pace`; they do not affect what is learned either.
+        jaw_speed, pinch_speed, clock_speed, retry_after: see `Pace`; they do not affect what is learned either.
         denoise: most successive images that are averaged wherever they stand still, when the policy
             acts (`evaluation.denoised_agent`); 1 leaves images as they are. It does not affect what
             is learned.
@@ -138,6 +138,7 @@ class Recipe:
     instance_norm: bool = field(default=False, metadata=LATER)
     speed: float = field(default=1.0, metadata=LATER)
     jaw_speed: float = field(default=1.0, metadata=LATER)
+    pinch_speed: float = field(default=1.0, metadata=LATER)
     clock_speed: float = field(default=1.0, metadata=LATER)
     retry_after: int = field(default=0, metadata=LATER)
     denoise: int = field(default=1, metadata=LATER)
@@ -204,7 +205,9 @@ class Recipe:
     @property
     def pace(self) -> Pace:
         """How fast a policy of this recipe acts."""
-        return Pace(self.speed, self.jaw_speed, self.clock_speed, self.retry_after)
+        return Pace(
+            self.speed, self.jaw_speed, self.pinch_speed, self.clock_speed, self.retry_after
+        )
 
 
 @dataclass(frozen=True)

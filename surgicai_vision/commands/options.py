@@ -168,9 +168,9 @@ AcceptLicence = Annotated[bool, Parameter(help="Accept weights under a non-comme
 ActingChanges = Annotated[
     tuple[str, ...],
     Parameter(
-        help="Values of speed, jaw_speed, clock_speed, retry_after and denoise and, for a policy "
-        "that plans chunks, of execute, samples, ensemble and measure_delay to use instead of its "
-        "recipe's.",
+        help="Values of speed, jaw_speed, pinch_speed, clock_speed, retry_after and denoise and, "
+        "for a policy that plans chunks, of execute, samples, ensemble and measure_delay to use "
+        "instead of its recipe's.",
         metavar="KEY=VALUE[,KEY=VALUE]",
     ),
     default_text("none"),

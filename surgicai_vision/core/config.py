@@ -531,7 +531,7 @@ def clock(steps: "NDArray[np.int64] | NDArray[np.float64]") -> "NDArray[np.float
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a policy acts: three shares, each above 0 and at most 1, and when it tries again.
+    """How fast a policy acts: four shares, each above 0 and at most 1, and when it tries again.
 
     Where actions take effect late, a policy at full speed swings about its goal, its jaws swing
     open and closed, and its clock says that it is there before it is (docs/evaluation.md).
@@ -539,6 +539,8 @@ class Pace:
     Attributes:
         speed: share of each action that is executed; the clock runs as much slower.
         jaw_speed: share of the jaw's motion that is executed besides.
+        pinch_speed: share of the jaw's motion that is executed besides where it shuts nearly closed
+            jaws (`evaluation.pace`).
         clock_speed: how much slower the clock runs besides.
         retry_after: control steps with shut jaws after which the clock of a policy that has learned
             a search goes on to the next attempt (`evaluation.policy_clock`); 0: it waits for it.
@@ -546,11 +548,12 @@ class Pace:
 
     speed: float = 1.0
     jaw_speed: float = 1.0
+    pinch_speed: float = 1.0
     clock_speed: float = 1.0
     retry_after: int = 0
 
     def __post_init__(self) -> None:
-        for key in ("speed", "jaw_speed", "clock_speed"):
+        for key in ("speed", "jaw_speed", "pinch_speed", "clock_speed"):
             share = getattr(self, key)
             if not 0 < share <= 1:
                 raise InputError(f"{key} is {share}; give a share above 0, at most 1.")
@@ -559,7 +562,7 @@ class Pace:
 
     @property
     def executed(self) -> "NDArray[np.float32]":
-        """Share of each of an action's values that is executed, (7,)."""
+        """Share of each of an action's values that is executed, (7,), but for `pinch_speed`."""
         import numpy as np  # not at the top, as in `clock`
 
         return np.array([self.speed] * 6 + [self.speed * self.jaw_speed], np.float32)

@@ -22,6 +22,7 @@ from surgicai_vision.evaluation.agent import (
     image_of,
     simulated,
 )
+from surgicai_vision.evaluation.pace import at_pace
 from surgicai_vision.evaluation.policy_clock import PolicyClock
 from surgicai_vision.training.progress_input import PROGRESS_AT
 from surgicai_vision.training.threads import one_thread
@@ -247,7 +248,7 @@ class PolicyAgent(Agent):
     ) -> Actions:
         """Return the policy's actions (n, 7), at its pace."""
         times = self.times(slots, robots)
-        return self.answer(robots, observations, times) * self.pace.executed
+        return at_pace(self.answer(robots, observations, times), robots, self.pace)
 
     def times(self, slots: Sequence[int], robots: Sequence[Robot]) -> list[float]:
         """Return what each slot's clock says, and let it run on; called once for each action."""

@@ -27,6 +27,7 @@ from policies.chunks import ChunkPolicy
 from surgicai_vision.evaluation.agent import Actions, Agent, FeatureTable, Observation, Robot
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.delay import DelayMeter
+from surgicai_vision.evaluation.pace import at_pace
 from surgicai_vision.evaluation.policy_clock import PolicyClock
 from surgicai_vision.training.threads import one_thread
 
@@ -136,7 +137,7 @@ class ChunkAgent(Agent):
                 episode.past.append(_Moment(seen, vector))
             self._plan([episode for episode in episodes if self._is_due(episode.tick)])
         actions = np.stack([self._action(episode) for episode in episodes])
-        executed = actions * self._senses.pace.executed
+        executed = at_pace(actions, robots, self._senses.pace)
         for episode, action in zip(episodes, executed, strict=True):
             episode.tick += 1
             if episode.meter is not None:

@@ -12,13 +12,10 @@ clock reads the arm's own jaw and nothing else.
 
 from typing import final
 
-from surgicai_vision.core import names
 from surgicai_vision.core.config import CLOCK_PERIOD, FULL_SPEED, SECOND_ATTEMPT_STEP, Pace
 from surgicai_vision.core.tasks import SUBTASK_STEPS
 from surgicai_vision.evaluation.agent import Robot
-
-JAW = names.STATE_NAMES.index("jaw")
-"""Where `Robot.agent_pos` has the jaw."""
+from surgicai_vision.evaluation.pace import JAW
 
 SHUT = 0.06
 """A jaw angle below this is shut [rad]; it need not be 0, since jaws close on tissue, too."""

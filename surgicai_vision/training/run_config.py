@@ -32,7 +32,7 @@ TERMINATIONS = ("privileged", "learned")
 BUDGET = "minutes"
 """Recipe setting that limits the training time (`policies.chunks.ChunkRecipe`)."""
 ACTED_BY = (
-    *("speed", "jaw_speed", "clock_speed", "retry_after", "denoise"),
+    *("speed", "jaw_speed", "pinch_speed", "clock_speed", "retry_after", "denoise"),
     *("execute", "samples", "ensemble", "measure_delay"),
 )
 """Settings of a recipe that do not affect what is learned: speeds, when the next attempt begins,

@@ -244,8 +244,8 @@ def test_how_chunks_are_acted_is_changed_without_a_training(
         (
             {"chunk": 2},
             UnknownName,
-            "clock_speed, denoise, ensemble, execute, jaw_speed, measure_delay, retry_after, "
-            "samples, speed",
+            "clock_speed, denoise, ensemble, execute, jaw_speed, measure_delay, pinch_speed, "
+            "retry_after, samples, speed",
         ),
         ({"excute": 1}, UnknownName, "Did you mean 'execute'"),
     ):

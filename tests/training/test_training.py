@@ -451,7 +451,7 @@ def test_a_recipe_without_instance_norm_keeps_its_identity() -> None:
     assert to_identity(Recipe(instance_norm=True))["instance_norm"] is True
 
 
-@pytest.mark.parametrize("key", ["speed", "jaw_speed", "clock_speed"])
+@pytest.mark.parametrize("key", ["speed", "jaw_speed", "pinch_speed", "clock_speed"])
 def test_a_recipe_at_full_speed_keeps_its_identity(key: str) -> None:
     assert key not in to_identity(Recipe())
     for wrong in (0.0, -0.5, 1.5, float("nan")):
