@@ -109,7 +109,8 @@ class Recipe:
             everywhere, or multiplies it by, then does not reach the head.
         speed: share of each action that is executed, above 0 and at most 1; the clock runs as much
             slower. It does not affect what is learned (docs/evaluation.md); see `Pace`.
-        jaw_speed, pinch_speed, clock_speed, retry_after: see `Pace`; they do not affect what is learned either.
+        jaw_speed, pinch_speed, clock_speed, retry_after: see `Pace`; they do not affect what is
+            learned either.
         denoise: most successive images that are averaged wherever they stand still, when the policy
             acts (`evaluation.denoised_agent`); 1 leaves images as they are. It does not affect what
             is learned.
